@@ -1,0 +1,70 @@
+"""Probabilistic joint-embedding world models, their losses, environments and planners, for TorchRL."""
+
+from torchrl_vjepa.baselines import PixelAR, PixelARLoss, PixelDecoder
+from torchrl_vjepa.belief import rollout
+from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
+from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
+from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, sample
+from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
+from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale
+from torchrl_vjepa.models import JEPA, VJEPA, LatentModel
+from torchrl_vjepa.noisy_tv import (
+    BatchedNoisyTVEnv,
+    KalmanFilter,
+    LinearGaussianSystem,
+    LQGController,
+    NoisyTVEnv,
+)
+from torchrl_vjepa.objectives import CollapseWarning, JEPALoss, RewardLoss, VJEPALoss
+from torchrl_vjepa.planners import CEM, MPPI, Planner, RandomShooting
+from torchrl_vjepa.predictor import Predictor
+from torchrl_vjepa.statistics import effective_rank, gaussian_entropy
+from torchrl_vjepa.whitening import Whitening
+
+__all__ = [
+    "BatchedNoisyTVEnv",
+    "CEM",
+    "CollapseWarning",
+    "Cost",
+    "Delta",
+    "DeltaHead",
+    "DiagGaussianHead",
+    "Head",
+    "JEPA",
+    "JEPALoss",
+    "KalmanFilter",
+    "LQGController",
+    "LatentEnv",
+    "LatentModel",
+    "LinearGaussianSystem",
+    "LinearProbe",
+    "MPPI",
+    "NoisyTVEnv",
+    "PixelAR",
+    "PixelARLoss",
+    "PixelDecoder",
+    "Planner",
+    "Predictor",
+    "QuadraticReward",
+    "RandomShooting",
+    "RewardLoss",
+    "TargetScale",
+    "VJEPA",
+    "VJEPALoss",
+    "Whitening",
+    "action_cost",
+    "diag_gaussian",
+    "effective_rank",
+    "expectation",
+    "gaussian_entropy",
+    "history_encoder",
+    "linear_encoder",
+    "linear_probe",
+    "mlp_encoder",
+    "mutual_information_bound",
+    "point_estimate",
+    "quadratic_cost",
+    "rollout",
+    "sample",
+]

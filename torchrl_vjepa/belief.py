@@ -1,0 +1,80 @@
+"""Beliefs over future latents: the predictive distribution, iterated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from torchrl_vjepa.distributions import point_estimate
+
+__all__ = ["Transition", "rollout"]
+
+Transition = Callable[[Tensor, Tensor], Distribution]
+
+
+def rollout(
+    transition: Transition,
+    latent: Tensor,
+    actions: Tensor,
+    how: Literal["mean", "mode", "sample"] = "mean",
+    num_samples: int = 1,
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    r"""Latent trajectories under a plan (``eq:VJEPA_multi_step_prediction``).
+
+    ``"mean"`` and ``"mode"`` iterate the point prediction, :math:`\hat Z_{t+1} = \mu_\phi(\hat Z_t, u_t)`;
+    ``"sample"`` draws :math:`Z^{(m)}_{t+1} \sim p_\phi(\cdot \mid Z^{(m)}_t, u_t)` for
+    :math:`m = 1, \dots, M`.
+
+    Args:
+        transition: ``(latent (*B, D), action (*B, A)) -> Distribution``, for instance ``Predictor.dist``.
+        latent: where to start, of shape ``(*B, D)``.
+        actions: the plan, of shape ``(*B, H, A)``.
+        how: point prediction or Monte Carlo.
+        num_samples: number of trajectories :math:`M` for ``"sample"``.
+        generator: source of randomness for ``"sample"``.
+
+    Returns:
+        Predicted latents :math:`Z_{t+1}, \dots, Z_{t+H}`: ``(*B, H, D)``, or ``(M, *B, H, D)`` for
+        ``"sample"``.
+
+    Raises:
+        ValueError: if shapes disagree, the plan is empty, ``how`` is unknown, ``num_samples`` is not
+            positive, or a point prediction is asked for with ``num_samples > 1``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa.distributions import diag_gaussian
+        >>> def walk(latent, action):
+        ...     return diag_gaussian(latent + action, torch.full_like(latent, 0.1))
+        >>> rollout(walk, torch.zeros(1), torch.ones(3, 1))
+        tensor([[1.],
+                [2.],
+                [3.]])
+        >>> rollout(walk, torch.zeros(1), torch.ones(3, 1), "sample", num_samples=8).shape
+        torch.Size([8, 3, 1])
+    """
+    if how not in ("mean", "mode", "sample"):
+        raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
+    if actions.ndim != latent.ndim + 1 or actions.shape[:-2] != latent.shape[:-1] or not actions.shape[-2]:
+        raise ValueError(
+            "actions must have shape (*B, H, A) with H of at least 1 and the batch dimensions of latent "
+            f"{tuple(latent.shape)}, got {tuple(actions.shape)}"
+        )
+    if num_samples < 1 or (how != "sample" and num_samples != 1):
+        raise ValueError(
+            f"num_samples must be positive, and 1 unless how='sample', got {num_samples} with how={how!r}"
+        )
+    if how == "sample":
+        latent = latent.expand(num_samples, *latent.shape)
+        actions = actions.expand(num_samples, *actions.shape)
+    latents = []
+    for action in actions.unbind(-2):
+        latent = point_estimate(transition(latent, action), how, generator=generator)
+        latents.append(latent)
+    return torch.stack(latents, dim=-2)

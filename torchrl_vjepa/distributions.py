@@ -1,0 +1,200 @@
+"""What ``torch.distributions`` lacks for latent world models.
+
+A predictive model returns a :class:`torch.distributions.Distribution` with batch shape ``*B`` and
+event shape ``(D,)``; the functions here read it in the ways the paper names (mean, mode, sample).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, Normal, constraints
+from torchrl.modules import Delta as _TorchRLDelta
+
+__all__ = ["Delta", "diag_gaussian", "point_estimate", "sample"]
+
+
+class Delta(_TorchRLDelta):
+    r"""Point mass on a latent, :math:`\delta(Z - \mu)`: the predictive model of a deterministic JEPA.
+
+    TorchRL's ``Delta`` with what a latent transition needs besides: a zero ``variance`` and
+    ``stddev``, and gradients through ``rsample`` only.
+
+    Args:
+        loc: the point, of shape ``(*B, D)``.
+
+    Examples:
+        >>> import torch
+        >>> p = Delta(torch.tensor([[1.0, 2.0]]))
+        >>> p.batch_shape, p.event_shape
+        (torch.Size([1]), torch.Size([2]))
+        >>> p.variance
+        tensor([[0., 0.]])
+    """
+
+    has_rsample = True
+
+    def __init__(self, loc: Tensor) -> None:
+        super().__init__(loc, batch_shape=loc.shape[:-1], event_shape=loc.shape[-1:])
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """The whole space: any vector can be the point."""
+        return constraints.real_vector
+
+    @property
+    def variance(self) -> Tensor:
+        """Zeros of shape ``(*B, D)``."""
+        return torch.zeros_like(self.param)
+
+    def sample(self, sample_shape: Sequence[int] | None = None) -> Tensor:
+        """The point, repeated, without gradient.
+
+        Args:
+            sample_shape: leading dimensions; none by default.
+
+        Returns:
+            A view of shape ``(*sample_shape, *B, D)``.
+        """
+        # TorchRL expands under no_grad, and a view made there still requires a gradient.
+        return self.rsample(sample_shape).detach()
+
+    def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> Delta:
+        """The same point, broadcast to ``batch_shape``.
+
+        Args:
+            batch_shape: the new batch shape.
+
+        Returns:
+            The expanded distribution.
+        """
+        return type(self)(self.param.expand(*batch_shape, *self.event_shape))
+
+
+def diag_gaussian(loc: Tensor, scale: Tensor) -> Independent:
+    r"""Diagonal Gaussian :math:`\mathcal N(\mu, \mathrm{diag}(\sigma^2))` over the last dimension.
+
+    Arguments are not validated: the check reads values, which stalls a GPU and breaks ``vmap``.
+
+    Args:
+        loc: mean, of shape ``(*B, D)``.
+        scale: standard deviation, positive, broadcastable to ``(*B, D)``.
+
+    Returns:
+        A distribution with batch ``*B`` and event ``(D,)``.
+
+    Examples:
+        >>> import torch
+        >>> diag_gaussian(torch.zeros(5, 3), torch.ones(3)).event_shape
+        torch.Size([3])
+    """
+    loc, scale = torch.broadcast_tensors(loc, scale)
+    # Under autocast a learned scale keeps its dtype, and torch.normal refuses two.
+    dtype = torch.promote_types(loc.dtype, scale.dtype)
+    loc, scale = loc.to(dtype), scale.to(dtype)
+    return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+
+def sample(
+    p: Distribution,
+    sample_shape: Sequence[int] = (),
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    r"""Draw :math:`Z^{(m)} \sim p` (``eq:vjepa_predictive_model``) from a generator of one's own.
+
+    ``torch.distributions`` can only read the global random state; with a ``generator`` this function
+    leaves it untouched.
+
+    Args:
+        p: the distribution, batch ``*B`` and event ``(D,)``.
+        sample_shape: leading dimensions of independent samples.
+        generator: source of randomness, on the device of ``p``; the global one if ``None``.
+
+    Returns:
+        Samples of shape ``(*sample_shape, *B, D)``, without gradient.
+
+    Raises:
+        ValueError: if ``generator`` is on another device than ``p``.
+
+    Examples:
+        >>> import torch
+        >>> p = diag_gaussian(torch.zeros(2), torch.ones(2))
+        >>> a = sample(p, (3,), generator=torch.Generator().manual_seed(0))
+        >>> b = sample(p, (3,), generator=torch.Generator().manual_seed(0))
+        >>> a.shape, torch.equal(a, b)
+        (torch.Size([3, 2]), True)
+    """
+    shape = torch.Size(sample_shape)
+    if generator is None or isinstance(p, Delta):
+        return p.sample(shape)
+    with torch.no_grad():
+        if isinstance(p, Independent) and isinstance(p.base_dist, Normal):
+            loc, scale = p.base_dist.loc, p.base_dist.scale
+            _check_device(generator, loc)
+            noise = torch.randn(shape + loc.shape, generator=generator, device=loc.device, dtype=loc.dtype)
+            return loc + scale * noise
+        device = generator.device
+        seed = int(torch.randint(2**62, (), generator=generator, device=device))
+        # torch.manual_seed would seed every device, also those that are not restored.
+        if device.type == "cpu":
+            with torch.random.fork_rng(devices=[]):
+                torch.default_generator.manual_seed(seed)
+                draw = p.sample(shape)
+        else:
+            module = torch.get_device_module(device)
+            with (
+                torch.random.fork_rng(devices=[device], device_type=device.type),
+                module.device(device),
+            ):
+                module.manual_seed(seed)
+                draw = p.sample(shape)
+        _check_device(generator, draw)
+        return draw
+
+
+def _check_device(generator: torch.Generator, value: Tensor) -> None:
+    if generator.device.type != value.device.type:
+        raise ValueError(
+            f"generator must be on the device of the distribution, {value.device}, got "
+            f"{generator.device}; make it with torch.Generator({value.device.type!r})"
+        )
+
+
+def point_estimate(
+    p: Distribution,
+    how: Literal["mean", "mode", "sample"] = "mean",
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    r"""One representative latent :math:`\hat Z_T` of a predictive distribution.
+
+    The mean :math:`\mathbb E_p[Z_T]`, the mode (MAP) :math:`\arg\max p(Z_T)`, or one draw, as in the
+    paper's section "Prediction and Uncertainty Propagation".
+
+    Args:
+        p: the distribution, batch ``*B`` and event ``(D,)``.
+        how: which point.
+        generator: source of randomness for ``"sample"``.
+
+    Returns:
+        A latent of shape ``(*B, D)``.
+
+    Raises:
+        ValueError: if ``how`` is none of the three.
+
+    Examples:
+        >>> import torch
+        >>> point_estimate(diag_gaussian(torch.ones(2), torch.ones(2)), "mode")
+        tensor([1., 1.])
+    """
+    if how == "mean":
+        return p.mean
+    if how == "mode":
+        return p.mode
+    if how == "sample":
+        return sample(p, generator=generator)
+    raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")

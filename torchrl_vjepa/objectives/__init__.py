@@ -1,0 +1,8 @@
+"""The losses of the paper as TorchRL LossModules."""
+
+from torchrl_vjepa.objectives.base import CollapseWarning, LatentPredictionLoss
+from torchrl_vjepa.objectives.jepa import JEPALoss
+from torchrl_vjepa.objectives.reward import RewardLoss
+from torchrl_vjepa.objectives.vjepa import VJEPALoss
+
+__all__ = ["CollapseWarning", "JEPALoss", "LatentPredictionLoss", "RewardLoss", "VJEPALoss"]

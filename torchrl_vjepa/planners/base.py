@@ -1,0 +1,450 @@
+"""What every sampling planner shares: the loop, the proposal, warm start, and TorchRL's edges."""
+
+from __future__ import annotations
+
+import abc
+import math
+import warnings
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.modules import MPCPlannerBase
+
+from torchrl_vjepa.envs import pack_generator, unpack_generator
+from torchrl_vjepa.planners.env_objective import EnvObjective
+
+__all__ = ["Plan", "Planner", "Proposal"]
+
+_GENERATORS = ("_generator", "_model_generator")
+
+
+class Proposal(NamedTuple):
+    """Diagonal Gaussian over action sequences, in the units of the actions.
+
+    Attributes:
+        mean: of shape ``(*B, H, A)``, inside the bounds.
+        std: of shape ``(*B, H, A)``, positive.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+
+class Plan(NamedTuple):
+    """What a planning call found.
+
+    Attributes:
+        actions: the plan, of shape ``(*B, H, A)``; its first step is executed.
+        std: spread of the last proposal, of shape ``(*B, H, A)``.
+        best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
+        best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite.
+    """
+
+    actions: Tensor
+    std: Tensor
+    best: Tensor
+    best_cost: Tensor
+
+
+class Planner(MPCPlannerBase):
+    r"""Sampling-based model predictive control: propose plans, imagine them, refine the proposal.
+
+    Each of ``optim_steps`` rounds draws ``num_candidates`` action sequences of length
+    ``planning_horizon`` from a Gaussian clamped to the action bounds, evaluates them in one call of
+    the environment's objective, and hands the ``top_k`` best to :meth:`update`, the one method in
+    which planners differ. The proposal's mean and the best plan so far are candidates of every
+    round (if there are at least three), so the best plan never gets worse. The spread never
+    exceeds that of a cold start.
+
+    **Costs that are not finite rank last** (``nan`` and both infinities: a cost of minus infinity
+    is a fault, not a good plan). Where no cost is finite the proposal keeps its mean, so the action
+    is finite and inside the bounds, and one warning is given.
+
+    **Memory between steps is in the tensordict.** With ``warm_start`` the planner reads
+    ``plan_key`` and ``init_key`` and writes ``("next", plan_key)``, the plan shifted by one step
+    with its last action repeated. Rows with ``init_key`` set, rows with a plan that is all zeros
+    (what the primer gives) or not finite, and inputs without a plan start cold, from the centre of
+    the bounds.
+    ``get_env_transforms_from_module(policy)`` gives the environment what it needs.
+
+    **Randomness** comes from a generator of the planner's own; the global random state is never
+    touched. All rows of a batch see the same noise: planning for many environments at once equals
+    planning for each alone from the same generator state, in any order. The generator's state
+    travels with pickling and ``copy.deepcopy``: workers of a collector draw the same noise unless
+    :meth:`set_seed` is called in them.
+
+    Args:
+        env: a :class:`~torchrl_vjepa.envs.LatentEnv`, or any TorchRL environment that is not
+            batch-locked, which is then stepped (see :class:`EnvObjective`).
+        planning_horizon: steps ``H`` that are imagined.
+        optim_steps: rounds.
+        num_candidates: plans ``N`` per round.
+        top_k: elites ``K`` that refine the proposal; ``num_candidates // 8`` by default.
+        action_key: where the action is written; the environment's by default.
+        warm_start: start from the plan of the step before.
+        warm_std: the spread after a warm start, as a fraction of the one after a cold start.
+        init_std: spread of the proposal after a cold start: a fraction of half the range where the
+            action is bounded (0.5 by default), in units of the action where it is not (no default).
+        min_std: floor under the spread, as a fraction of the one after a cold start.
+        antithetic: draw noise in pairs of opposite sign.
+        output: the plan is the ``"mean"`` of the proposal, or the ``"best"`` candidate seen.
+        return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
+            (spread of the proposal) and ``("plan_stats", "cost")`` (predicted cost of the plan).
+        plan_key: the plan's entry.
+        init_key: set where an episode begins (``InitTracker``).
+        seed: of the generator; by default the global seed, ``torch.initial_seed()``.
+        generator: used instead of one made from ``seed``.
+
+    Raises:
+        ValueError: if an argument is out of its range, or the bounds of an action are degenerate.
+        TypeError: if the action is not one continuous tensor.
+
+    Examples:
+        A planner of one's own is one method:
+
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> from torchrl_vjepa.envs import LatentEnv
+        >>> class LocalSearch(Planner):
+        ...     def update(self, proposal, elites, costs):
+        ...         return Proposal(elites[..., 0, :, :], 0.5 * proposal.std)
+        >>> def move(latent, action):
+        ...     return Delta(latent + action)
+        >>> env = LatentEnv(
+        ...     move,
+        ...     action_spec=Bounded(-1, 1, (1,)),
+        ...     cost=quadratic_cost(torch.ones(1)),
+        ...     latent_dim=1,
+        ... )
+        >>> planner = LocalSearch(env, planning_horizon=1, optim_steps=8, seed=0)
+        >>> out = planner(TensorDict(latent=torch.tensor([0.5])))
+        >>> out["action"].round(decimals=2), out["next", "plan"].shape
+        (tensor([0.5000]), torch.Size([1, 1]))
+    """
+
+    low: Tensor
+    high: Tensor
+    centre: Tensor
+    cold_std: Tensor
+
+    def __init__(
+        self,
+        env: EnvBase,
+        planning_horizon: int,
+        optim_steps: int = 4,
+        num_candidates: int = 512,
+        top_k: int | None = None,
+        *,
+        action_key: NestedKey | None = None,
+        warm_start: bool = True,
+        warm_std: float = 0.3,
+        init_std: float | None = None,
+        min_std: float = 0.01,
+        antithetic: bool = True,
+        output: Literal["mean", "best"] = "mean",
+        return_stats: bool = False,
+        plan_key: NestedKey = "plan",
+        init_key: NestedKey = "is_init",
+        seed: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        for name, value in (
+            ("planning_horizon", planning_horizon),
+            ("optim_steps", optim_steps),
+            ("num_candidates", num_candidates),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+        if top_k is None:
+            top_k = max(1, num_candidates // 8)
+        if not 1 <= top_k <= num_candidates:
+            raise ValueError(f"top_k must be in [1, num_candidates={num_candidates}], got {top_k}")
+        if not 0 < warm_std <= 1:
+            raise ValueError(f"warm_std must be in (0, 1], got {warm_std}")
+        if not 0 < min_std <= 1:
+            raise ValueError(f"min_std must be in (0, 1], got {min_std}")
+        if init_std is not None and not 0 < init_std < math.inf:
+            raise ValueError(f"init_std must be positive and finite, got {init_std}")
+        if output not in ("mean", "best"):
+            raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
+        if seed is not None and generator is not None:
+            raise ValueError("at most one of seed and generator must be given, got both")
+        leaves = [unravel_key(key) for key in env.full_action_spec.keys(True, True)]
+        spec = _continuous(env.full_action_spec[leaves[0]] if len(leaves) == 1 else None, leaves)
+        low, high, centre, std = _gaussian_of_bounds(spec, init_std)
+        written = leaves[0] if action_key is None else unravel_key(action_key)
+        super().__init__(env, written)
+        # Looked up on the class: a transform around a LatentEnv must be stepped, not bypassed.
+        offers_objective = callable(getattr(type(env), "objective", None))
+        self._env_objective = None if offers_objective else EnvObjective(env)
+        self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
+        self.num_candidates, self.top_k = num_candidates, top_k
+        self.warm_start, self.warm_std, self.min_std = warm_start, warm_std, min_std
+        self.antithetic, self.output, self.return_stats = antithetic, output, return_stats
+        self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
+        self.action_shape = tuple(spec.shape)
+        for name, tensor in (("low", low), ("high", high), ("centre", centre), ("cold_std", std)):
+            self.register_buffer(name, tensor.flatten(), persistent=False)
+        own = self._env_objective
+        reads = [env.latent_key] if own is None else list(own.in_keys)
+        writes = [written]
+        if warm_start:
+            reads += [self.plan_key, self.init_key]
+            writes.append(unravel_key(("next", self.plan_key)))
+        if return_stats:
+            writes += [("plan_stats", name) for name in ("actions", "std", "cost")]
+        self.in_keys, self.out_keys = reads, writes
+        if generator is None:
+            generator = torch.Generator(self.low.device)
+            generator.manual_seed(torch.initial_seed() if seed is None else seed)
+        self._generator = generator
+        self._model_generator = _offspring(generator, generator.device)
+
+    @abc.abstractmethod
+    def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
+        """Refine the proposal: the one method in which planners differ.
+
+        Args:
+            proposal: what the candidates were drawn from.
+            elites: the best candidates of this round, best first, of shape ``(*B, K, H, A)``.
+            costs: their costs, of shape ``(*B, K)``; infinite for those that were not finite, never
+                ``nan``. What is returned for rows without any finite cost is not used.
+
+        Returns:
+            The next proposal; the base class puts its mean inside the bounds and its spread
+            between the floor and the spread of a cold start.
+        """
+
+    @property
+    def generator(self) -> torch.Generator:
+        """The planner's own source of randomness."""
+        return self._generator
+
+    def set_seed(self, seed: int) -> None:
+        """Seed the planner's generators.
+
+        Args:
+            seed: any integer that ``torch.Generator.manual_seed`` takes.
+        """
+        self._generator.manual_seed(seed)
+        self._model_generator = _offspring(self._generator, self._generator.device)
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that carries the plan from step to step, zero at every reset.
+
+        Returns:
+            A primer of ``plan_key``; of nothing without ``warm_start``. It is found by TorchRL's
+            ``get_env_transforms_from_module``, which also adds the ``InitTracker``.
+        """
+        primers = {}
+        if self.warm_start:
+            shape = (self.planning_horizon, *self.action_shape)
+            primers[self.plan_key] = Unbounded(shape, device=self.low.device, dtype=self.low.dtype)
+        return TensorDictPrimer(Composite(primers), expand_specs=True)
+
+    def planning(self, td: TensorDictBase) -> Tensor:
+        """The action to execute.
+
+        Args:
+            td: where to plan from.
+
+        Returns:
+            Actions of shape ``(*B, *action_shape)``.
+        """
+        with torch.no_grad():
+            plan = self._plan_from(td)[1]
+        return self._shaped(plan.actions[..., 0, :])
+
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        tensordict_out: TensorDictBase | None = None,
+        **kwargs: Any,
+    ) -> TensorDictBase:
+        """Write the action, the plan for the next step and, if asked for, the statistics.
+
+        Args:
+            tensordict: where to plan from; only the entries that planning reads are touched.
+            tensordict_out: where to write instead of the input.
+            **kwargs: none is supported.
+
+        Returns:
+            The tensordict written to.
+
+        Raises:
+            TypeError: if another keyword is given.
+            KeyError: if an entry is missing.
+            ValueError: if a plan in the input has another shape.
+        """
+        if kwargs:
+            raise TypeError(f"{type(self).__name__} takes no keywords, got {sorted(kwargs)}")
+        with torch.no_grad():
+            state, plan = self._plan_from(tensordict)
+            written = [self._shaped(plan.actions[..., 0, :])]
+            if self.warm_start:
+                shifted = torch.cat([plan.actions[..., 1:, :], plan.actions[..., -1:, :]], dim=-2)
+                written.append(self._shaped(shifted))
+            if self.return_stats:
+                cost = self._evaluate(state, plan.actions.unsqueeze(-3))
+                written += [self._shaped(plan.actions), self._shaped(plan.std), cost]
+        return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
+
+    def plan(self, state: Any, proposal: Proposal) -> Plan:
+        """Plan from a state: the whole algorithm, on tensors.
+
+        Args:
+            state: what ``planning_state`` of the environment gives, with batch ``*B``.
+            proposal: where the search starts, with batch ``*B``.
+
+        Returns:
+            The plan. No value leaves the device.
+        """
+        low, high = self.low, self.high
+        floor = self.min_std * self.cold_std
+        best = proposal.mean
+        best_cost = best.new_full(best.shape[:-2], math.inf)
+        model_state = self._model_generator.get_state()
+        for _ in range(self.optim_steps):
+            # The model's noise is the same in every round: costs of different rounds compare.
+            self._model_generator.set_state(model_state)
+            candidates = self._candidates(proposal, best)
+            costs = self._evaluate(state, candidates)
+            elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
+            index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
+            elites = candidates.gather(-3, index)
+            found = elite_costs[..., 0].isfinite()[..., None, None]
+            better = elite_costs[..., 0] < best_cost
+            best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
+            best_cost = torch.where(better, elite_costs[..., 0], best_cost)
+            mean, std = self.update(proposal, elites, elite_costs)
+            mean = torch.where(found, mean, proposal.mean).clamp(low, high)
+            std = torch.where(found, std, proposal.std).clamp(floor, self.cold_std)
+            proposal = Proposal(mean, std)
+        actions = proposal.mean if self.output == "mean" else best
+        return Plan(actions, proposal.std, best, best_cost)
+
+    @property
+    def _source(self) -> Any:
+        return self.env if self._env_objective is None else self._env_objective
+
+    def _plan_from(self, tensordict: TensorDictBase) -> tuple[Any, Plan]:
+        state = self._source.planning_state(tensordict)
+        batch = state.shape[:-1] if isinstance(state, Tensor) else state.batch_size
+        self._follow_device()
+        plan = self.plan(state, self._start(tensordict, batch))
+        if not bool(plan.best_cost.isfinite().all()):
+            warnings.warn(
+                "no candidate plan has a finite cost in at least one row: its action is the mean "
+                "of the proposal; check the model, the cost and the input for nan and inf",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+        return state, plan
+
+    def _start(self, tensordict: TensorDictBase, batch: torch.Size) -> Proposal:
+        """Proposal from the plan of the step before where there is one, else from the bounds."""
+        shape = (*batch, self.planning_horizon, self.low.shape[0])
+        mean, std = self.centre.expand(shape), self.cold_std.expand(shape)
+        plan = tensordict.get(self.plan_key, None) if self.warm_start else None
+        if plan is None:
+            return Proposal(mean, std)
+        expected = (*batch, self.planning_horizon, *self.action_shape)
+        if tuple(plan.shape) != expected:
+            raise ValueError(f"{self.plan_key!r} must have shape {expected}, got {tuple(plan.shape)}")
+        plan = plan.to(mean.dtype).reshape(shape)
+        rows = plan.flatten(-2)
+        warm = rows.isfinite().all(dim=-1) & (rows != 0).any(dim=-1)
+        is_init = tensordict.get(self.init_key, None)
+        if is_init is not None:
+            warm = warm & ~is_init.reshape(batch).bool()
+        warm = warm[..., None, None]
+        return Proposal(
+            torch.where(warm, plan.clamp(self.low, self.high), mean),
+            torch.where(warm, self.warm_std * std, std),
+        )
+
+    def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
+        """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
+        mean, std = proposal
+        num = self.num_candidates
+        drawn = (num + 1) // 2 if self.antithetic else num
+        noise = torch.randn(
+            (drawn, *mean.shape[-2:]),
+            generator=self._generator,
+            device=mean.device,
+            dtype=mean.dtype,
+        )
+        if self.antithetic:
+            noise = torch.cat([noise, -noise])[:num]
+        candidates = torch.addcmul(mean.unsqueeze(-3), std.unsqueeze(-3), noise)
+        candidates = candidates.clamp_(self.low, self.high)
+        if num > 1:
+            candidates[..., 0, :, :] = mean
+        if num > 2:
+            candidates[..., 1, :, :] = best
+        return candidates
+
+    def _evaluate(self, state: Any, candidates: Tensor) -> Tensor:
+        costs = self._source.objective(state, candidates, generator=self._model_generator)
+        costs = costs.to(candidates.dtype)
+        return torch.where(costs.isfinite(), costs, math.inf)
+
+    def _shaped(self, actions: Tensor) -> Tensor:
+        return actions.reshape((*actions.shape[:-1], *self.action_shape))
+
+    def __getstate__(self) -> dict[str, Any]:
+        packed = {name: pack_generator(self.__dict__[name]) for name in _GENERATORS}
+        return {**super().__getstate__(), **packed}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        unpacked = {name: unpack_generator(state[name]) for name in _GENERATORS}
+        super().__setstate__({**state, **unpacked})
+
+    def _follow_device(self) -> None:
+        """Generators live on one device: after ``.to(device)`` new ones continue from the old."""
+        if self._generator.device != self.low.device:
+            self._generator = _offspring(self._generator, self.low.device)
+            self._model_generator = _offspring(self._generator, self.low.device)
+
+
+def _offspring(generator: torch.Generator, device: torch.device) -> torch.Generator:
+    """A new generator, seeded by a draw from another."""
+    seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+    return torch.Generator(device).manual_seed(int(seed))
+
+
+def _continuous(spec: TensorSpec | None, keys: list[NestedKey]) -> TensorSpec:
+    supported = "one continuous tensor (Bounded or Unbounded, floating point)"
+    if spec is None:
+        raise TypeError(f"the action of env must be {supported}, got the keys {keys}")
+    if not isinstance(spec, (Bounded, Unbounded)) or not spec.dtype.is_floating_point:
+        raise TypeError(f"the action of env must be {supported}, got {type(spec).__name__} of {spec.dtype}")
+    return spec
+
+
+def _gaussian_of_bounds(spec: TensorSpec, init_std: float | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Bounds, and mean and standard deviation of a proposal that knows nothing yet."""
+    low, high = spec.space.low.clone(), spec.space.high.clone()
+    limit = 0.5 * torch.finfo(low.dtype).max  # Unbounded has the largest number as its bound
+    bounded = (low > -limit) & (high < limit)
+    if bool((~(low < high)).any()):
+        raise ValueError(
+            "action bounds must satisfy low < high, got "
+            f"low={low.flatten().tolist()} and high={high.flatten().tolist()}"
+        )
+    if init_std is None and not bool(bounded.all()):
+        raise ValueError(
+            "init_std must be given, in units of the action, for an action without finite bounds, "
+            f"got None with low={low.flatten().tolist()} and high={high.flatten().tolist()}"
+        )
+    half_range = torch.where(bounded, 0.5 * high - 0.5 * low, 1.0)
+    middle = torch.where(bounded, 0.5 * high + 0.5 * low, torch.zeros_like(low).clamp(low, high))
+    return low, high, middle, half_range * (0.5 if init_std is None else init_std)

@@ -1,0 +1,82 @@
+"""Cross-entropy method: the proposal becomes the Gaussian of the best plans."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchrl_vjepa.planners.base import Planner, Proposal
+
+__all__ = ["CEM"]
+
+
+class CEM(Planner):
+    r"""Cross-entropy method.
+
+    The next proposal has the mean of the elites, all counting the same, and their root mean square
+    distance from the mean *before* (see :func:`weighted_gaussian`). Only the ranking of costs
+    matters: any increasing function of the cost gives the same plan.
+    Takes the arguments of :class:`Planner`, positional ones in the order of TorchRL's
+    ``CEMPlanner``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> from torchrl_vjepa.envs import LatentEnv
+        >>> def move(latent, action):
+        ...     return Delta(latent + action)
+        >>> env = LatentEnv(
+        ...     move,
+        ...     action_spec=Bounded(-1, 1, (1,)),
+        ...     cost=quadratic_cost(torch.ones(1)),
+        ...     latent_dim=1,
+        ... )
+        >>> planner = CEM(env, planning_horizon=1, optim_steps=8, num_candidates=256, seed=0)
+        >>> planner(TensorDict(latent=torch.tensor([0.5])))["action"].round(decimals=2)
+        tensor([0.5000])
+    """
+
+    def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
+        """Mean and spread of the elites whose cost is finite.
+
+        Args:
+            proposal: what the candidates were drawn from.
+            elites: best first, of shape ``(*B, K, H, A)``.
+            costs: of shape ``(*B, K)``.
+
+        Returns:
+            The next proposal.
+        """
+        weights = costs.isfinite().to(elites.dtype)
+        return weighted_gaussian(elites, weights, proposal.mean)
+
+
+def weighted_gaussian(elites: Tensor, weights: Tensor, previous_mean: Tensor) -> Proposal:
+    r"""Weighted mean of candidates, and their spread around the mean before.
+
+    :math:`\mu' = \sum_i w_i u_i`, :math:`\sigma'^2 = \sum_i w_i (u_i - \mu)^2` with
+    :math:`\sum_i w_i = 1`. Deviations are taken from :math:`\mu`, as CMA-ES does: around
+    :math:`\mu'` few elites shrink the spread before the mean has arrived, which with 128 candidates
+    doubled what the planner loses against LQR on the noisy TV.
+
+    Args:
+        elites: of shape ``(*B, K, H, A)``.
+        weights: non-negative, of shape ``(*B, K)``; normalised here.
+        previous_mean: :math:`\mu`, of shape ``(*B, H, A)``.
+
+    Returns:
+        The proposal; not finite where all weights are zero.
+
+    Examples:
+        >>> import torch
+        >>> elites = torch.tensor([1.0, 7.0]).reshape(2, 1, 1)
+        >>> weighted_gaussian(elites, torch.ones(2), torch.zeros(1, 1))
+        Proposal(mean=tensor([[4.]]), std=tensor([[5.]]))
+    """
+    w = (weights / weights.sum(dim=-1, keepdim=True))[..., None, None]
+    mean = (w * elites).sum(dim=-3)
+    variance = (w * (elites - previous_mean.unsqueeze(-3)).square()).sum(dim=-3)
+    return Proposal(mean, torch.sqrt(variance))

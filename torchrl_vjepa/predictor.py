@@ -1,0 +1,248 @@
+"""The predictor: latent, actions, skip and side information -> distribution over a future latent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torchrl.modules import MLP
+
+from torchrl_vjepa.distributions import point_estimate
+from torchrl_vjepa.heads import DiagGaussianHead, Head
+from torchrl_vjepa.windows import read
+
+__all__ = ["Predictor"]
+
+
+class Predictor(TensorDictModuleBase):
+    r"""Predictive model :math:`p_\phi(Z_{t+\Delta} \mid Z_t, \xi_{t+\Delta}, u_{t:t+\Delta-1})`.
+
+    The controlled latent transition of ``eq:vjepa_controlled_dynamics``. :math:`\Delta` is one of
+    ``skips``; the action chunk :math:`u_{t:t+\Delta-1}` and an optional side information tensor
+    :math:`\xi` are concatenated to the latent. With ``trunk="linear"`` every skip has its own matrix
+    (a linear map cannot be conditioned otherwise); with ``trunk="mlp"`` one network is shared by all
+    skips, reads the chunk padded with zeros, and is told the skip as a one-hot vector.
+
+    As a TensorDictModule it reads ``latent`` (and ``action``, ``side_info``) and writes the one-step
+    point prediction to ``("next", "latent")``. :meth:`dist` is the distribution, on plain tensors: it
+    is a *transition* wherever the library asks for one.
+
+    Args:
+        latent_dim: size ``D`` of the latent.
+        action_dim: size ``A`` of the action; 0 for a system without control.
+        head: features -> distribution; :class:`DiagGaussianHead` by default.
+        skips: the prediction steps :math:`\Delta` that are learned; positive and distinct.
+        trunk: ``"linear"`` or ``"mlp"``.
+        num_cells: widths of the hidden layers of ``trunk="mlp"``.
+        activation_class: nonlinearity of ``trunk="mlp"``.
+        side_info_dim: size ``S`` of :math:`\xi`; 0 for none.
+        bias: whether the linear trunk has a bias (the paper's has none; the MLP always has).
+        residual: whether the mean is :math:`Z_t` plus the output of the trunk.
+        how: which point of the distribution ``forward`` writes.
+        latent_key: where the latent is read.
+        action_key: where the action is read.
+        side_info_key: where the side information is read.
+        out_key: where the prediction is written.
+
+    Raises:
+        ValueError: if a size, a skip, ``trunk`` or ``how`` is not valid.
+
+    Examples:
+        >>> import torch
+        >>> predictor = Predictor(latent_dim=4, action_dim=2, skips=(1, 3))
+        >>> predictor.dist(torch.zeros(7, 4), torch.zeros(7, 2)).mean.shape
+        torch.Size([7, 4])
+        >>> predictor.dist(torch.zeros(7, 4), torch.zeros(7, 3, 2), skip=3).variance.shape
+        torch.Size([7, 4])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int = 0,
+        *,
+        head: Head | None = None,
+        skips: Sequence[int] = (1,),
+        trunk: Literal["linear", "mlp"] = "linear",
+        num_cells: Sequence[int] = (256, 256),
+        activation_class: type[nn.Module] = nn.SiLU,
+        side_info_dim: int = 0,
+        bias: bool = False,
+        residual: bool = False,
+        how: Literal["mean", "mode", "sample"] = "mean",
+        latent_key: NestedKey = "latent",
+        action_key: NestedKey = "action",
+        side_info_key: NestedKey = "side_info",
+        out_key: NestedKey = ("next", "latent"),
+    ) -> None:
+        super().__init__()
+        if latent_dim < 1:
+            raise ValueError(f"latent_dim must be positive, got {latent_dim}")
+        if action_dim < 0 or side_info_dim < 0:
+            raise ValueError(
+                f"action_dim and side_info_dim must be at least 0, got {action_dim} and {side_info_dim}"
+            )
+        if any(int(skip) != skip for skip in skips):
+            raise ValueError(f"skips must be integers, got {tuple(skips)}")
+        skips = tuple(int(skip) for skip in skips)
+        if not skips or min(skips) < 1 or len(set(skips)) != len(skips):
+            raise ValueError(f"skips must be distinct positive integers, at least one, got {skips}")
+        if trunk not in ("linear", "mlp"):
+            raise ValueError(f"trunk must be 'linear' or 'mlp', got {trunk!r}")
+        if how not in ("mean", "mode", "sample"):
+            raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
+        self.latent_dim = latent_dim
+        self.action_dim = action_dim
+        self.side_info_dim = side_info_dim
+        self.skips = skips
+        self.trunk = trunk
+        self.residual = residual
+        self.how = how
+        self.head = DiagGaussianHead() if head is None else head
+        num_features = self.head.num_features(latent_dim)
+        if trunk == "linear":
+            self.trunks = nn.ModuleList(
+                nn.Linear(latent_dim + skip * action_dim + side_info_dim, num_features, bias=bias)
+                for skip in skips
+            )
+        else:
+            in_features = latent_dim + max(skips) * action_dim + len(skips) + side_info_dim
+            self.trunks = nn.ModuleList(
+                [
+                    MLP(
+                        in_features=in_features,
+                        out_features=num_features,
+                        num_cells=list(num_cells),
+                        activation_class=activation_class,
+                    )
+                ]
+            )
+        self.constants = nn.Parameter(torch.zeros(len(skips), self.head.num_constants(latent_dim)))
+        self.latent_key, self.action_key, self.side_info_key = latent_key, action_key, side_info_key
+        self.in_keys = [latent_key]
+        if action_dim:
+            self.in_keys.append(action_key)
+        if side_info_dim:
+            self.in_keys.append(side_info_key)
+        self.out_keys = [out_key]
+
+    def reset_parameters(self) -> None:
+        """Set the constants of the head back to zero (the trunks reset themselves)."""
+        with torch.no_grad():
+            self.constants.zero_()
+
+    def dist(
+        self,
+        latent: Tensor,
+        action: Tensor | None = None,
+        *,
+        skip: int = 1,
+        side_info: Tensor | None = None,
+    ) -> Distribution:
+        r"""The predictive distribution of the latent ``skip`` steps ahead.
+
+        Args:
+            latent: :math:`Z_t`, of shape ``(*B, D)``.
+            action: :math:`u_{t:t+\Delta-1}`, of shape ``(*B, skip, A)``, or ``(*B, A)`` for ``skip=1``;
+                ``None`` or empty (``A = 0``) if ``action_dim`` is 0.
+            skip: :math:`\Delta`, one of ``skips``.
+            side_info: :math:`\xi`, of shape ``(*B, S)``; ``None`` if ``side_info_dim`` is 0.
+
+        Returns:
+            Distribution with batch ``*B`` and event ``(D,)``.
+
+        Raises:
+            ValueError: if a shape does not fit or ``skip`` was not learned.
+            TypeError: if the inputs have another dtype than the weights, outside of autocast.
+        """
+        if skip not in self.skips:
+            raise ValueError(f"skip must be one of skips={self.skips}, got {skip}")
+        if not latent.ndim or latent.shape[-1] != self.latent_dim:
+            raise ValueError(f"latent must have shape (*B, {self.latent_dim}), got {tuple(latent.shape)}")
+        inputs = [latent]
+        if self.action_dim or action is not None:
+            inputs.append(self._chunk(latent, action, skip))
+        index = self.skips.index(skip)
+        if self.trunk == "mlp":
+            if self.action_dim:
+                inputs[-1] = F.pad(inputs[-1], (0, (max(self.skips) - skip) * self.action_dim))
+            one_hot = F.one_hot(torch.tensor(index, device=latent.device), len(self.skips))
+            inputs.append(one_hot.to(latent.dtype).expand(*latent.shape[:-1], -1))
+        if self.side_info_dim or side_info is not None:
+            inputs.append(self._side_info(latent, side_info))
+        trunk = self.trunks[index if self.trunk == "linear" else 0]
+        joined = torch.cat(inputs, dim=-1) if len(inputs) > 1 else latent
+        dtype = self.constants.dtype
+        if joined.dtype != dtype and not torch.is_autocast_enabled(joined.device.type):
+            raise TypeError(
+                f"latent, action and side_info must have the dtype of the predictor's weights, {dtype}, "
+                f"got {[item.dtype for item in (latent, action, side_info) if item is not None]}; cast them"
+            )
+        features = trunk(joined)
+        if self.residual:
+            features = torch.cat(
+                [features[..., : self.latent_dim] + latent, features[..., self.latent_dim :]],
+                dim=-1,
+            )
+        return self.head(features, self.constants[index])
+
+    def dist_of(self, tensordict: TensorDictBase) -> Distribution:
+        """The one-step predictive distribution of what ``in_keys`` names.
+
+        Args:
+            tensordict: holds ``latent`` and what else ``in_keys`` names.
+
+        Returns:
+            Distribution with batch ``*B`` and event ``(D,)``.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        latent, *rest = (read(tensordict, key, reader=type(self).__name__) for key in self.in_keys)
+        return self.dist(
+            latent,
+            rest.pop(0) if self.action_dim else None,
+            side_info=rest.pop(0) if self.side_info_dim else None,
+        )
+
+    def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
+        batch = latent.shape[:-1]
+        shapes = [(*batch, skip, self.action_dim)]
+        if skip == 1:
+            shapes.append((*batch, self.action_dim))
+        if action is None or tuple(action.shape) not in shapes:
+            raise ValueError(
+                f"action must have shape {' or '.join(map(str, shapes))} for skip={skip} and "
+                f"action_dim={self.action_dim}, got {None if action is None else tuple(action.shape)}"
+            )
+        return action.reshape(*batch, skip * self.action_dim)
+
+    def _side_info(self, latent: Tensor, side_info: Tensor | None) -> Tensor:
+        shape = (*latent.shape[:-1], self.side_info_dim)
+        if side_info is None or tuple(side_info.shape) != shape:
+            raise ValueError(
+                f"side_info must have shape {shape} for side_info_dim={self.side_info_dim}, "
+                f"got {None if side_info is None else tuple(side_info.shape)}"
+            )
+        return side_info
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the one-step point prediction.
+
+        Args:
+            tensordict: holds ``latent`` and what else ``in_keys`` names.
+
+        Returns:
+            The same tensordict with the entry ``out_keys[0]``.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        p = self.dist_of(tensordict)
+        return tensordict.set(self.out_keys[0], point_estimate(p, self.how))
