@@ -484,7 +484,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="tiny sizes: a test, not a result")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write settings and rows as JSON")
     parser.add_argument(
-        "--out", type=Path, default=Path("results"), metavar="FOLDER", help="where the figure goes"
+        "--out", type=Path, default=Path("outputs"), metavar="FOLDER", help="where the figure goes"
     )
     return parser.parse_args(arguments)
 

@@ -75,6 +75,7 @@ class TestQuadraticCost:
             (torch.zeros(2), torch.ones(2, 3), r"got shape \(2, 3\)"),
             (torch.zeros(2), -1.0, "positive semi-definite"),
             (torch.zeros(2), torch.tensor([[0.0, 1.0], [1.0, 0.0]]), "positive semi-definite"),
+            (torch.zeros(2), torch.tensor([[1.0, 9.0], [0.0, 1.0]]), "positive semi-definite"),
             (torch.zeros(2), torch.inf, "weight must be finite"),
         ],
     )

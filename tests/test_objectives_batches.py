@@ -199,6 +199,12 @@ def test_side_information_is_that_of_the_target() -> None:
 # --- several models as one batch
 
 
+def first_gradients(loss: Any, batch: TensorDict) -> dict[str, torch.Tensor]:
+    torch.manual_seed(11)
+    total(loss(batch)).backward()
+    return {name: p.grad for name, p in loss.named_parameters() if p.numel()}
+
+
 def trained(loss: Any, batches: list[TensorDict]) -> list[TensorDict]:
     updater = SoftUpdate(loss, eps=0.8)
     optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
@@ -223,25 +229,17 @@ def test_a_list_trains_like_each_model_alone(build: Callable[..., Any], stacked:
     for batch in batches:
         batch["is_init"] = torch.rand(*batch.shape, 1) < 0.1
         batch["collector", "mask"] = torch.rand(*batch.shape, 1) < 0.9
+    gradients = first_gradients(build(copy.deepcopy(models), stacked_data=stacked), batches[0])
     several = build(copy.deepcopy(models), stacked_data=stacked)
-    torch.manual_seed(11)
-    total(several(batches[0])).backward()
-    gradients = {name: p.grad.clone() for name, p in several.named_parameters() if p.numel()}
-    several.zero_grad()
     history = trained(several, batches)
     for i, model in enumerate(models):
-        alone = build(model)
         mine = [batch[i] if stacked else batch for batch in batches]
-        torch.manual_seed(11)
-        total(alone(mine[0])).backward()
-        for name, parameter in alone.named_parameters():
-            if parameter.numel():
-                torch.testing.assert_close(parameter.grad, gradients[name][i])
-        alone.zero_grad()
+        for name, gradient in first_gradients(build(copy.deepcopy(model)), mine[0]).items():
+            torch.testing.assert_close(gradient, gradients[name][i])
+        alone = build(model)
         for ours, theirs in zip(history, trained(alone, mine), strict=True):
-            torch.testing.assert_close(ours[..., i].to_dict() if ours.ndim else {
-                key: value[i] for key, value in ours.items()
-            }, theirs.to_dict(), rtol=1e-6, atol=1e-8)
+            ours = {key: value[i] for key, value in ours.items()}
+            torch.testing.assert_close(ours, theirs.to_dict(), rtol=1e-6, atol=1e-8)
         state = several.get_model(i).state_dict()
         torch.testing.assert_close(state, alone.get_model().state_dict(), rtol=1e-6, atol=1e-8)
 

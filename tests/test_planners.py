@@ -194,6 +194,14 @@ def cold(planner: Planner, num: int) -> Proposal:
     return Proposal(planner.centre.expand(shape), planner.cold_std.expand(shape))
 
 
+class Runaway(Planner):
+    next_std: float
+
+    def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
+        mean = torch.full_like(proposal.mean, 1e6)
+        return Proposal(mean, torch.full_like(mean, self.next_std))
+
+
 class TestUpdate:
     def test_cem_is_mean_and_spread_around_the_mean_before(self) -> None:
         planner = CEM(lqr_env(), 3)
@@ -259,6 +267,26 @@ class TestUpdate:
         mean, std = planner.update(cold(planner, 1), elites, costs)
         assert mean.isfinite().all()
         assert std.isfinite().all()
+
+    @pytest.mark.parametrize("normalize", [True, False])
+    def test_mppi_where_even_the_difference_of_costs_overflows(self, normalize: bool) -> None:
+        planner = MPPI(lqr_env(), 2, normalize_costs=normalize)
+        elites, costs = torch.randn(1, 3, 2, 2), torch.tensor([[-3e38, 3e38, 3e38]])
+        mean, std = planner.update(cold(planner, 1), elites, costs)
+        assert mean.isfinite().all()
+        assert std.isfinite().all()
+        weight = 1 / (1 + 2 * math.exp(-(3 / 2**0.5) / 0.5)) if normalize else 1.0
+        expected = weight * elites[:, 0] + (1 - weight) / 2 * elites[:, 1:].sum(1)
+        torch.testing.assert_close(mean, expected)
+
+    @pytest.mark.parametrize("std", [0.0, 1e6])
+    def test_whatever_an_update_returns_stays_inside(self, std: float) -> None:
+        planner = Runaway(lqr_env(), 2, 2, 16, seed=0, min_std=0.1)
+        planner.next_std = std
+        plan = planner.plan(states(3)["latent"], cold(planner, 3))
+        assert (plan.actions == 3.0).all()
+        expected = planner.cold_std * (0.1 if std == 0 else 1.0)
+        torch.testing.assert_close(plan.std, expected.expand(3, 2, 2))
 
     def test_random_shooting_keeps_the_proposal(self) -> None:
         planner = RandomShooting(lqr_env(), 3)

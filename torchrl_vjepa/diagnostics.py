@@ -133,9 +133,7 @@ def linear_probe(
     weight = torch.linalg.lstsq(z - z_mean, s - s_mean, driver="gelsd").solution.mT
     bias = s_mean - weight @ z_mean
     probe = LinearProbe(weight, bias, float("nan"), float("nan"))
-    return probe._replace(
-        r2_train=_r2(s, probe.predict(z)), r2_test=_r2(s_test, probe.predict(z_test))
-    )
+    return probe._replace(r2_train=_r2(s, probe.predict(z)), r2_test=_r2(s_test, probe.predict(z_test)))
 
 
 def mutual_information_bound(

@@ -186,9 +186,7 @@ class _HistoryEncoder(GRUModule):
         """Encode one step, or a window under ``set_recurrent_mode(True)``."""
         observation_key, state_key, is_init_key = self.in_keys
         observation = tensordict[observation_key]
-        check_observation(
-            observation, self.observation_dim, observation_key, self.readout.weight.dtype
-        )
+        check_observation(observation, self.observation_dim, observation_key, self.readout.weight.dtype)
         batch = observation.shape[:-1]
         windows = self.recurrent_mode
         if windows and (not batch or batch[-1] == 0):
@@ -337,7 +335,5 @@ def _check_whitening(whitening: Whitening | None, observation_dim: int) -> None:
 def _as_flag(flag: Tensor, key: NestedKey, batch: torch.Size) -> Tensor:
     """Check a boolean of shape ``batch`` or ``(*batch, 1)`` and return it with shape ``batch``."""
     if flag.shape not in (batch, (*batch, 1)):
-        raise ValueError(
-            f"{key!r} must have shape {tuple(batch)} or {(*batch, 1)}, got {tuple(flag.shape)}."
-        )
+        raise ValueError(f"{key!r} must have shape {tuple(batch)} or {(*batch, 1)}, got {tuple(flag.shape)}.")
     return flag.reshape(batch).bool()

@@ -137,6 +137,13 @@ class Predictor(TensorDictModuleBase):
         with torch.no_grad():
             self.constants.zero_()
 
+    def _reset_parameters(self, module: nn.Module) -> bool:
+        # reset_parameters_recursive visits the children only, not the module that it is called on.
+        any_reset = super()._reset_parameters(module)
+        if module is self:
+            self.reset_parameters()
+        return any_reset
+
     def dist(
         self,
         latent: Tensor,

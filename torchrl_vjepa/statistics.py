@@ -208,15 +208,12 @@ def _as_rows(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         raise TypeError(f"Samples must be floating point, got {x.dtype}; cast them first.")
     if x.ndim == 0 or x.shape[-1] == 0 or x.numel() == 0:
         raise ValueError(
-            f"Samples must have shape (*B, D) with at least one row and one feature, "
-            f"got {tuple(x.shape)}."
+            f"Samples must have shape (*B, D) with at least one row and one feature, got {tuple(x.shape)}."
         )
     batch = x.shape[:-1]
     if mask is not None:
         if mask.dtype is not torch.bool:
-            raise TypeError(
-                f"mask must be boolean (False marks rows that do not count), got {mask.dtype}."
-            )
+            raise TypeError(f"mask must be boolean (False marks rows that do not count), got {mask.dtype}.")
         if mask.shape not in (batch, (*batch, 1)):
             raise ValueError(
                 f"mask must have shape {tuple(batch)} or {(*batch, 1)} to fit samples of shape "

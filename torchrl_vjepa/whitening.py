@@ -51,9 +51,7 @@ def check_observation(
         >>> check_observation(torch.zeros(3, 2), 2, "observation")
     """
     if observation.ndim == 0 or observation.shape[-1] != observation_dim:
-        raise ValueError(
-            f"{key!r} must have shape (*B, {observation_dim}), got {tuple(observation.shape)}."
-        )
+        raise ValueError(f"{key!r} must have shape (*B, {observation_dim}), got {tuple(observation.shape)}.")
     if not observation.is_floating_point():
         raise TypeError(f"{key!r} must be floating point, got {observation.dtype}; cast it first.")
     if dtype is None or observation.dtype == dtype:
@@ -139,9 +137,7 @@ class Whitening(nn.Module):
         self.floor = floor
         self.register_buffer("count", torch.zeros((), dtype=torch.int64))
         self.register_buffer("mean", torch.zeros(observation_dim, dtype=torch.float64))
-        self.register_buffer(
-            "covariance", torch.zeros(observation_dim, observation_dim, dtype=torch.float64)
-        )
+        self.register_buffer("covariance", torch.zeros(observation_dim, observation_dim, dtype=torch.float64))
         self.register_buffer("transform", torch.eye(observation_dim))
         self.register_buffer("inverse_transform", torch.eye(observation_dim))
 

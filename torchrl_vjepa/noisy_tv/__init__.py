@@ -23,6 +23,4 @@ __all__ = [
 
 # A second import (importlib.reload, a spawned worker) must not override with a warning.
 if "torchrl_vjepa/NoisyTV-v0" not in gymnasium.registry:
-    gymnasium.register(
-        id="torchrl_vjepa/NoisyTV-v0", entry_point="torchrl_vjepa.noisy_tv.env:NoisyTVEnv"
-    )
+    gymnasium.register(id="torchrl_vjepa/NoisyTV-v0", entry_point="torchrl_vjepa.noisy_tv.env:NoisyTVEnv")

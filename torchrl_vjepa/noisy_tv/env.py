@@ -36,9 +36,7 @@ class _Task:
         episode_length: int,
     ) -> None:
         if system is None:
-            system = LinearGaussianSystem(
-                control_dim=2, seed=0 if system_seed is None else system_seed
-            )
+            system = LinearGaussianSystem(control_dim=2, seed=0 if system_seed is None else system_seed)
         elif system_seed is not None:
             raise ValueError(
                 f"system_seed must be None when a system is given, got {system_seed}: "
@@ -165,9 +163,7 @@ class NoisyTVEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         action_bound: float = 2.0,
         episode_length: int = 200,
     ) -> None:
-        self._task = _Task(
-            noise_scale, system_seed, system, action_cost, action_bound, episode_length
-        )
+        self._task = _Task(noise_scale, system_seed, system, action_cost, action_bound, episode_length)
         self.system = self._task.system
         self.noise_scale = self._task.noise_scale
         self.action_space = gymnasium.spaces.Box(
@@ -221,9 +217,7 @@ class NoisyTVEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise RuntimeError("step needs a running episode: call reset first.")
         u = np.asarray(action, dtype=np.float64)
         if u.shape != self.action_space.shape or not np.isfinite(u).all():
-            raise ValueError(
-                f"action must be finite with shape {self.action_space.shape}, got {action!r}."
-            )
+            raise ValueError(f"action must be finite with shape {self.action_space.shape}, got {action!r}.")
         control = torch.from_numpy(u).clamp(-self._task.action_bound, self._task.action_bound)
         self._signal, self._distractor, observation = self.system.step(
             self._signal,
@@ -301,9 +295,7 @@ class BatchedNoisyTVEnv(EnvBase):
         device: torch.device | str | None = None,
     ) -> None:
         num_envs = check_positive_int("num_envs", num_envs)
-        self._task = _Task(
-            noise_scale, system_seed, system, action_cost, action_bound, episode_length
-        )
+        self._task = _Task(noise_scale, system_seed, system, action_cost, action_bound, episode_length)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.system = self._task.system
         self.noise_scale = self._task.noise_scale
@@ -342,9 +334,7 @@ class BatchedNoisyTVEnv(EnvBase):
         # A row that was never reset counts as over.
         self._time = torch.full((num_envs,), self._task.episode_length, device=self.device)
         self._state = self.observation_spec.zero()
-        self._state["goal"] = self.system.goal.to(self._state["goal"]).expand_as(
-            self._state["goal"]
-        )
+        self._state["goal"] = self.system.goal.to(self._state["goal"]).expand_as(self._state["goal"])
         self._set_seed(seed)
 
     def to(self, device: torch.device | str) -> BatchedNoisyTVEnv:
@@ -365,8 +355,7 @@ class BatchedNoisyTVEnv(EnvBase):
         if seed is not None:
             check_positive_int("seed", seed, minimum=0)
         self._seeders = [
-            seeding.np_random(None if seed is None else seed + row)[0]
-            for row in range(self.batch_size[0])
+            seeding.np_random(None if seed is None else seed + row)[0] for row in range(self.batch_size[0])
         ]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:

@@ -12,10 +12,10 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
 from torch import Tensor
-from torch.distributions import Distribution
 from torchrl.objectives.common import LossModule
 
 from torchrl_vjepa.models import JEPA
+from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.predictor import Predictor
 from torchrl_vjepa.statistics import covariance_entropy, covariance_rank, masked_moments
 from torchrl_vjepa.windows import (
@@ -26,7 +26,7 @@ from torchrl_vjepa.windows import (
     step_mask,
 )
 
-__all__ = ["CollapseWarning", "LatentPredictionLoss", "Pairs"]
+__all__ = ["CollapseWarning", "LatentPredictionLoss"]
 
 
 class CollapseWarning(UserWarning):
@@ -36,70 +36,6 @@ class CollapseWarning(UserWarning):
         >>> issubclass(CollapseWarning, UserWarning)
         True
     """
-
-
-@dataclass
-class Pairs:
-    r"""All pairs :math:`(t, t + \Delta)` of a batch of windows for one skip.
-
-    Attributes:
-        skip: :math:`\Delta`.
-        dist: predictive distribution with batch ``(B, T - skip)``.
-        target: target latents, of shape ``(B, T - skip, D)``.
-        context: context latents, of the same shape.
-        action: action chunks ``(B, T - skip, skip, A)``, or ``None``.
-        side_info: side information ``(B, T - skip, S)``, or ``None``.
-        mask: pairs that count, ``(B, T - skip)``, or ``None`` for all.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_vjepa import Delta
-        >>> latent = torch.zeros(1, 2, 3)
-        >>> mask = torch.tensor([[True, False]])
-        >>> Pairs(1, Delta(latent), latent, latent, None, None, mask).mean(torch.tensor([[1.0, 9.0]]))
-        tensor(1.)
-    """
-
-    skip: int
-    dist: Distribution
-    target: Tensor
-    context: Tensor
-    action: Tensor | None
-    side_info: Tensor | None
-    mask: Tensor | None
-
-    def __post_init__(self) -> None:
-        """Weights that sum to one over the pairs that count."""
-        if self.mask is not None:
-            weight = self.mask.to(self.target.dtype)
-            self._weight = weight / weight.sum().clamp_min(1)
-
-    def mean(self, value: Tensor) -> Tensor:
-        """Mean over the pairs that count.
-
-        Args:
-            value: one finite number per pair, ``(B, T - skip)``, or more in trailing dimensions.
-
-        Returns:
-            The mean over the first two dimensions; zero if no pair counts.
-        """
-        if self.mask is None:
-            return value.mean((0, 1))
-        return torch.tensordot(self._weight, value, dims=2)
-
-    def second_moment(self, value: Tensor) -> Tensor:
-        """Mean of the outer products over the pairs that count.
-
-        Args:
-            value: one finite vector per pair, ``(B, T - skip, D)``.
-
-        Returns:
-            A matrix of shape ``(D, D)``; zero if no pair counts.
-        """
-        rows = value.reshape(-1, value.shape[-1])
-        if self.mask is None:
-            return rows.mT @ rows / rows.shape[0]
-        return rows.mT @ (rows * self._weight.reshape(-1, 1))
 
 
 class LatentPredictionLoss(LossModule):
@@ -169,11 +105,9 @@ class LatentPredictionLoss(LossModule):
     predictor_params: TensorDictParams
     target_predictor_params: TensorDictParams
 
-    _schedulable_buffers = frozenset(
-        {"variance_coeff", "covariance_coeff", "marginal_entropy_coeff"}
-    )
+    _schedulable_buffers = frozenset({"variance_coeff", "covariance_coeff", "marginal_entropy_coeff"})
     _vmap_randomness = "same"
-    #: How often (in calls) the effective rank is compared with ``collapse_rank``: a comparison makes a GPU wait.
+    #: The effective rank is compared with ``collapse_rank`` in every so many calls: it makes a GPU wait.
     collapse_interval: int = 20
 
     def __init__(
@@ -208,7 +142,6 @@ class LatentPredictionLoss(LossModule):
         self._register_coeff("variance_coeff", variance_coeff)
         self._register_coeff("covariance_coeff", covariance_coeff)
         self._register_coeff("marginal_entropy_coeff", marginal_entropy_coeff)
-        self._regularised = any((variance_coeff, covariance_coeff, marginal_entropy_coeff))
         self.collapse_rank = float(collapse_rank)
         self.reduction = reduction
         self._calls = 0
@@ -267,8 +200,7 @@ class LatentPredictionLoss(LossModule):
     # What a member adds
 
     def _loss_keys(self) -> Iterator[str]:
-        if self._regularised:
-            yield from ("loss_variance", "loss_covariance", "loss_entropy")
+        yield from ("loss_variance", "loss_covariance", "loss_entropy")
 
     def _diagnostic_keys(self) -> Iterator[str]:
         yield from ()
@@ -356,9 +288,7 @@ class LatentPredictionLoss(LossModule):
         if "effective_rank" in terms:
             self._watch(terms["effective_rank"])
         out = TensorDict(terms, batch_size=[])
-        self._clear_weakrefs(
-            tensordict, out, "encoder_params", "target_encoder_params", "predictor_params"
-        )
+        self._clear_weakrefs(tensordict, out, "encoder_params", "target_encoder_params", "predictor_params")
         return out
 
     def _read(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, dict[str, Tensor]]:
@@ -384,7 +314,8 @@ class LatentPredictionLoss(LossModule):
         for key, value in entries.items():
             if value.shape[: len(batch)] != batch or value.ndim == len(batch):
                 raise ValueError(
-                    f"{key!r} must have shape {(*batch, '...')} like {required[-1]!r}, got {tuple(value.shape)}"
+                    f"{key!r} must have shape {(*batch, '...')} like {required[-1]!r}, "
+                    f"got {tuple(value.shape)}"
                 )
             if not value.is_floating_point():
                 raise ValueError(
@@ -403,9 +334,7 @@ class LatentPredictionLoss(LossModule):
             if value is not None:
                 entries[key] = value.reshape(*batch, *value.shape[len(batch) :])
         mask = step_mask(tensordict, self._loss_mask_keys(), batch)
-        flags = [
-            tensordict.get(key, None) for key in (self.tensor_keys.done, self.tensor_keys.is_init)
-        ]
+        flags = [tensordict.get(key, None) for key in (self.tensor_keys.done, self.tensor_keys.is_init)]
         for i, flag in enumerate(flags):
             if flag is not None:
                 if flag.shape not in (batch, (*batch, 1)):
@@ -424,9 +353,7 @@ class LatentPredictionLoss(LossModule):
                 keep = mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
                 entries[key] = torch.where(keep, value, 0)
             mask = mask.reshape(shape)
-        masks = {
-            str(skip): pair_mask(flags[0], flags[1], mask, skip) for skip in self.predictor.skips
-        }
+        masks = {str(skip): pair_mask(flags[0], flags[1], mask, skip) for skip in self.predictor.skips}
         masks["steps"] = mask
         data = TensorDict(entries, batch_size=batch).reshape(shape)
         return data, {key: value for key, value in masks.items() if value is not None}
@@ -472,15 +399,12 @@ class LatentPredictionLoss(LossModule):
                 info = None if side_info is None else side_info[:, skip:]
                 p = predictor.dist(context, chunks, skip=skip, side_info=info)
                 pair_target = target[:, skip:]
-                pairs.append(
-                    Pairs(skip, p, pair_target, context, chunks, info, masks.get(str(skip)))
-                )
+                pairs.append(Pairs(skip, p, pair_target, context, chunks, info, masks.get(str(skip))))
             with torch.autocast(latent.device.type, enabled=False):
                 terms = self._member_terms(pairs, target_latent, data, mask, member_params)
         with torch.autocast(latent.device.type, enabled=False):
             mean, covariance = masked_moments(latent, mask)
-            if self._regularised:
-                terms.update(self._regularisers(mean, covariance))
+            terms.update(self._regularisers(mean, covariance))
             if self.reduction != "none":
                 covariance = covariance.detach()
                 terms["effective_rank"] = covariance_rank(covariance)
@@ -504,8 +428,7 @@ class LatentPredictionLoss(LossModule):
         return {
             "loss_variance": self.variance_coeff * (1 - (variance + 1e-4).sqrt()).relu().mean(),
             "loss_covariance": self.covariance_coeff * off_diagonal / dim,
-            "loss_entropy": self.marginal_entropy_coeff
-            * (0.5 * trace + gaussian_constant - entropy),
+            "loss_entropy": self.marginal_entropy_coeff * (0.5 * trace + gaussian_constant - entropy),
         }
 
     def _reduce(self, per_skip: list[Tensor], pairs: list[Pairs]) -> Tensor:

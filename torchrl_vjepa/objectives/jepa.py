@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_vjepa.models import JEPA
-from torchrl_vjepa.objectives.base import LatentPredictionLoss, Pairs
+from torchrl_vjepa.objectives.base import LatentPredictionLoss
+from torchrl_vjepa.objectives.pairs import Pairs
 
 __all__ = ["JEPALoss"]
 
@@ -24,8 +25,7 @@ class JEPALoss(LatentPredictionLoss):
     where :math:`g_\phi` is the predictive mean. The paper's JEPA adds VICReg: ``prediction_coeff=25/D``
     (VICReg averages the square over the D dimensions), ``variance_coeff=25``, ``covariance_coeff=1``.
 
-    Entries: ``loss_prediction``, with a regulariser also ``loss_variance``, ``loss_covariance``,
-    ``loss_entropy``; diagnostics ``effective_rank``, ``latent_std``, ``error_skip_<k>``.
+    Entries: ``loss_prediction``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``; diagnostics ``effective_rank``, ``latent_std``, ``error_skip_<k>``.
 
     Args:
         model: the model, or a list of models that train as one batch (:class:`LatentPredictionLoss`).

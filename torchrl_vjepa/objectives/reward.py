@@ -195,9 +195,7 @@ class RewardLoss(LossModule):
             mask = mask.reshape(-1, batch[-1])
         data = TensorDict(entries, batch_size=batch).reshape(-1, batch[-1])
         steps = self.num_steps
-        action = (
-            action.reshape(-1, batch[-1], action.shape[-1]).unfold(1, steps, 1).transpose(-1, -2)
-        )
+        action = action.reshape(-1, batch[-1], action.shape[-1]).unfold(1, steps, 1).transpose(-1, -2)
         reward = reward.reshape(-1, batch[-1], 1).unfold(1, steps, 1).transpose(-1, -2)
 
         latents = self._imagine(data, action)
@@ -208,7 +206,8 @@ class RewardLoss(LossModule):
             predicted = self.reward_model(imagined).get(self.reward_model.out_keys[0])
         if predicted.shape != reward.shape:
             raise ValueError(
-                f"reward_model must write rewards of shape {tuple(reward.shape)}, got {tuple(predicted.shape)}"
+                f"reward_model must write rewards of shape {tuple(reward.shape)}, "
+                f"got {tuple(predicted.shape)}"
             )
         error = (predicted - reward).squeeze(-1)
         counts: Tensor | None = self._rollout_mask(tensordict, mask, batch)
@@ -227,9 +226,7 @@ class RewardLoss(LossModule):
         self, tensordict: TensorDictBase, mask: Tensor | None, batch: torch.Size
     ) -> Tensor | None:
         """Rollouts that stay in one episode: steps ``t .. t + num_steps - 1`` are joined."""
-        flags = [
-            tensordict.get(key, None) for key in (self.tensor_keys.done, self.tensor_keys.is_init)
-        ]
+        flags = [tensordict.get(key, None) for key in (self.tensor_keys.done, self.tensor_keys.is_init)]
         flags = [None if flag is None else flag.reshape(-1, batch[-1]) for flag in flags]
         if self.num_steps == 1:
             return mask

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchrl_vjepa.distributions import diag_gaussian
 from torchrl_vjepa.models import JEPA, VJEPA
-from torchrl_vjepa.objectives.base import LatentPredictionLoss, Pairs
+from torchrl_vjepa.objectives.base import LatentPredictionLoss
+from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.statistics import covariance_entropy, masked_moments
 
 __all__ = ["VJEPALoss"]
@@ -34,8 +35,8 @@ class VJEPALoss(LatentPredictionLoss):
     section "Necessity of Target Sampling" says what the mean would do). The mean of :math:`q` follows
     by EMA, its scale learns as ``target_scale_gradient`` says.
 
-    Entries: ``loss_nll``, ``loss_target_kl``, with ``residual_variance="batch"`` also ``loss_head``,
-    with a regulariser also ``loss_variance``, ``loss_covariance``, ``loss_entropy``. Diagnostics:
+    Entries: ``loss_nll``, ``loss_target_kl``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``,
+    with ``residual_variance="batch"`` also ``loss_head``. Diagnostics:
     ``effective_rank``, ``latent_std``, ``target_std``, ``mutual_information`` (the Gaussian form of
     the bound of ``thm:mi_bound``, in nats, mean over skips: the score by which restarts are chosen),
     ``nll_skip_<k>``.
@@ -109,9 +110,7 @@ class VJEPALoss(LatentPredictionLoss):
                 f"target_scale_gradient must be 'kl', 'both' or 'none', got {target_scale_gradient!r}"
             )
         if residual_variance not in ("head", "batch"):
-            raise ValueError(
-                f"residual_variance must be 'head' or 'batch', got {residual_variance!r}"
-            )
+            raise ValueError(f"residual_variance must be 'head' or 'batch', got {residual_variance!r}")
         models: list[JEPA] = [model] if isinstance(model, JEPA) else list(model)
         if not all(isinstance(m, VJEPA) for m in models):
             raise ValueError("model must be a VJEPA or a list of them; for a JEPA use JEPALoss")
@@ -192,9 +191,7 @@ class VJEPALoss(LatentPredictionLoss):
                 means = [pair.mean(nll) for pair, nll in zip(pairs, nlls, strict=True)]
                 terms["target_std"] = std.mean()
                 _, covariance = masked_moments(pairs[0].target, pairs[0].mask)
-                terms["mutual_information"] = (
-                    covariance_entropy(covariance) - torch.stack(means).mean()
-                )
+                terms["mutual_information"] = covariance_entropy(covariance) - torch.stack(means).mean()
                 for pair, head_nll in zip(pairs, head_nlls, strict=True):
                     terms[f"nll_skip_{pair.skip}"] = pair.mean(head_nll).detach()
         return terms

@@ -59,8 +59,7 @@ def weighted_gaussian(elites: Tensor, weights: Tensor, previous_mean: Tensor) ->
 
     :math:`\mu' = \sum_i w_i u_i`, :math:`\sigma'^2 = \sum_i w_i (u_i - \mu)^2` with
     :math:`\sum_i w_i = 1`. Deviations are taken from :math:`\mu`, as CMA-ES does: around
-    :math:`\mu'` few elites shrink the spread before the mean has arrived, which with 128 candidates
-    doubled what the planner loses against LQR on the noisy TV.
+    :math:`\mu'` few elites shrink the spread before the mean has arrived.
 
     Args:
         elites: of shape ``(*B, K, H, A)``.
