@@ -95,12 +95,13 @@ class Settings:
     frames: int = option(20_000, "random steps collected from each system")
     latent_dim: int = option(4, "size of the latent, no larger than the signal's")
     skips: list[int] = option([1, 4, 16], "prediction steps that are learned together")
-    restarts: int = option(12, "VJEPAs and JEPAs trained side by side; the objective chooses one")
-    train_steps: int = option(700, "optimiser steps")
+    skip_weights: list[float] = option([0.1, 0.3, 0.6], "their weights: long skips tell the distractor apart")
+    restarts: int = option(4, "VJEPAs and JEPAs trained side by side; the objective chooses one")
+    train_steps: int = option(600, "optimiser steps")
     windows: int = option(32, "windows in a batch")
     window: int = option(20, "steps in a window, more than the largest skip")
-    lr: float = option(0.03, "peak learning rate of VJEPA and PixelAR (one cycle)")
-    jepa_lr: float = option(0.1, "peak learning rate of JEPA (one cycle)")
+    lr: float = option(0.1, "peak learning rate of VJEPA and JEPA (one cycle)")
+    pixel_lr: float = option(0.03, "peak learning rate of PixelAR (one cycle)")
     ema_decay: float = option(0.9, "tau of the target encoder")
     planning_horizon: int = option(6, "steps that MPPI imagines")
     optim_steps: int = option(5, "MPPI rounds for each action")
@@ -113,8 +114,8 @@ class Settings:
 QUICK = {
     "noise_scales": [0.0, 8.0],
     "frames": 8_000,
-    "restarts": 6,
-    "train_steps": 300,
+    "restarts": 2,
+    "train_steps": 250,
     "episodes": 4,
     "optim_steps": 3,
 }
@@ -180,10 +181,11 @@ def make_jepa(system: System, settings: Settings) -> JEPA:
     )
 
 
-def vjepa_loss(models: Sequence[VJEPA]) -> VJEPALoss:
+def vjepa_loss(models: Sequence[VJEPA], settings: Settings) -> VJEPALoss:
     """The mutual information bound: likelihood at the optimal residual covariance, and entropy."""
     return VJEPALoss(
         models,
+        skip_weights=settings.skip_weights,
         stacked_data=True,
         target_kl_coeff=0.0,
         residual_variance="batch",
@@ -191,9 +193,15 @@ def vjepa_loss(models: Sequence[VJEPA]) -> VJEPALoss:
     )
 
 
-def jepa_loss(models: Sequence[JEPA]) -> JEPALoss:
+def jepa_loss(models: Sequence[JEPA], settings: Settings) -> JEPALoss:
     """Squared error, with the same entropy term against collapse."""
-    return JEPALoss(models, stacked_data=True, prediction_coeff=0.5, marginal_entropy_coeff=1.0)
+    return JEPALoss(
+        models,
+        skip_weights=settings.skip_weights,
+        stacked_data=True,
+        prediction_coeff=0.5,
+        marginal_entropy_coeff=1.0,
+    )
 
 
 def objective(losses: TensorDict) -> Tensor:
@@ -204,9 +212,8 @@ def objective(losses: TensorDict) -> Tensor:
 def train_restarts(
     name: str,
     make_model: Callable[[System, Settings], Any],
-    make_loss: Callable[[Sequence[Any]], Any],
+    make_loss: Callable[[Sequence[Any], Settings], Any],
     score: Callable[[TensorDict], Tensor],
-    lr: float,
     systems: Sequence[System],
     settings: Settings,
 ) -> list[LatentModel]:
@@ -215,11 +222,11 @@ def train_restarts(
     for system in systems:
         torch.manual_seed(system.seed)
         models += [make_model(system, settings) for _ in range(settings.restarts)]
-    loss = make_loss(models)
+    loss = make_loss(models, settings)
     updater = SoftUpdate(loss, eps=settings.ema_decay)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=lr, fused=True)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, lr, total_steps=settings.train_steps, pct_start=0.2
+        optimizer, settings.lr, total_steps=settings.train_steps, pct_start=0.2
     )
 
     def windows(keys: Sequence[Any] = ("observation", "action", ("next", "done"))) -> TensorDict:
@@ -249,8 +256,10 @@ def train_pixel_ar(system: System, settings: Settings) -> PixelAR:
     encoder = linear_encoder(20, settings.latent_dim)
     model = PixelAR(encoder, PixelDecoder(encoder, settings.latent_dim, 20, action_dim=2))
     loss = PixelARLoss(model)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, settings.lr, total_steps=settings.train_steps)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=settings.pixel_lr)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, settings.pixel_lr, total_steps=settings.train_steps
+    )
     for _ in range(settings.train_steps):
         loss(system.buffer.sample().reshape(-1, settings.window))["loss_reconstruction"].backward()
         optimizer.step()
@@ -344,7 +353,6 @@ def run_seed(seed: int, settings: Settings) -> tuple[list[Row], Episodes]:
         make_vjepa,
         vjepa_loss,
         lambda losses: losses["mutual_information"],
-        settings.lr,
         systems,
         settings,
     )
@@ -353,7 +361,6 @@ def run_seed(seed: int, settings: Settings) -> tuple[list[Row], Episodes]:
         make_jepa,
         jepa_loss,
         lambda losses: -objective(losses),
-        settings.jepa_lr,
         systems,
         settings,
     )
@@ -433,6 +440,7 @@ def figure(rows: Sequence[Row], episodes: Episodes, path: Path) -> None:
     seen.plot(episode["observation"][:, 0], color="0.6", lw=1, label="what the camera sees")
     seen.plot(controllable, color="black", lw=1.5, label="the part that can be controlled")
     seen.set(xlabel="time (steps)", ylabel="first pixel", title=f"The noisy TV, noise scale {scale:g}")
+    seen.margins(y=0.25)
     seen.legend(loc="upper right", frameon=False)
 
     for name, label in CONTROLLERS.items():

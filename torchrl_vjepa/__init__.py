@@ -1,14 +1,14 @@
 """Probabilistic joint-embedding world models, their losses, environments and planners, for TorchRL."""
 
-from torchrl_vjepa.baselines import PixelAR, PixelARLoss, PixelDecoder
+from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import rollout
 from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
-from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, sample
+from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale
-from torchrl_vjepa.models import JEPA, VJEPA, LatentModel
+from torchrl_vjepa.models import BJEPA, JEPA, VJEPA, LatentModel
 from torchrl_vjepa.noisy_tv import (
     BatchedNoisyTVEnv,
     KalmanFilter,
@@ -16,13 +16,16 @@ from torchrl_vjepa.noisy_tv import (
     LQGController,
     NoisyTVEnv,
 )
-from torchrl_vjepa.objectives import CollapseWarning, JEPALoss, RewardLoss, VJEPALoss
+from torchrl_vjepa.objectives import BJEPALoss, CollapseWarning, JEPALoss, RewardLoss, VJEPALoss, WindowLoss
 from torchrl_vjepa.planners import CEM, MPPI, Planner, RandomShooting
-from torchrl_vjepa.predictor import Predictor
+from torchrl_vjepa.predictor import FusedPredictor, Predictor
+from torchrl_vjepa.priors import GaussianPrior
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
+    "BJEPA",
+    "BJEPALoss",
     "BatchedNoisyTVEnv",
     "CEM",
     "CollapseWarning",
@@ -30,6 +33,8 @@ __all__ = [
     "Delta",
     "DeltaHead",
     "DiagGaussianHead",
+    "FusedPredictor",
+    "GaussianPrior",
     "Head",
     "JEPA",
     "JEPALoss",
@@ -50,9 +55,12 @@ __all__ = [
     "RandomShooting",
     "RewardLoss",
     "TargetScale",
+    "VAE",
+    "VAELoss",
     "VJEPA",
     "VJEPALoss",
     "Whitening",
+    "WindowLoss",
     "action_cost",
     "diag_gaussian",
     "effective_rank",
@@ -64,6 +72,7 @@ __all__ = [
     "mlp_encoder",
     "mutual_information_bound",
     "point_estimate",
+    "product_of_experts",
     "quadratic_cost",
     "rollout",
     "sample",

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams
 from torch import Tensor, nn
 from torchrl.modules import MLP
-from torchrl.objectives.common import LossModule
 
 from torchrl_vjepa.distributions import Delta
 from torchrl_vjepa.models import LatentModel
-from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
+from torchrl_vjepa.objectives import WindowLoss
+from torchrl_vjepa.windows import read
 
-__all__ = ["PixelAR", "PixelARLoss", "PixelDecoder"]
+__all__ = ["VAE", "PixelAR", "PixelARLoss", "PixelDecoder", "VAELoss"]
 
 
 class PixelDecoder(TensorDictModuleBase):
@@ -80,11 +79,7 @@ class PixelDecoder(TensorDictModuleBase):
         self.encoder = encoder
         self.latent_dim, self.observation_dim = latent_dim, observation_dim
         self.action_dim = action_dim
-        self.decoder = (
-            nn.Linear(latent_dim + action_dim, observation_dim, bias=False)
-            if trunk == "linear"
-            else MLP(latent_dim + action_dim, observation_dim, num_cells=list(num_cells))
-        )
+        self.decoder = _trunk(trunk, latent_dim + action_dim, observation_dim, num_cells)
         self.latent_key, self.action_key = latent_key, action_key
         self.in_keys = [latent_key, action_key] if action_dim else [latent_key]
         self.out_keys = [out_key]
@@ -174,18 +169,158 @@ class PixelAR(LatentModel):
         super().__init__(encoder, decoder)
 
 
-class PixelARLoss(LossModule):
+class VAE(TensorDictModuleBase):
+    r"""Variational autoencoder of single observations: the static baseline of the noisy TV.
+
+    :math:`q(z_t \mid x_t) = \mathcal N(\mu(x_t), \mathrm{diag}(\sigma^2(x_t)))` and
+    :math:`\hat x_t = g(z_t)` (the paper's "Linear Variational Autoencoder"). Writes the mean to
+    ``latent``.
+
+    Args:
+        observation_dim: size ``O`` of the observation.
+        latent_dim: size ``D`` of the latent.
+        trunk: ``"linear"`` (no bias, as in the paper) or ``"mlp"``.
+        num_cells: widths of the hidden layers of ``trunk="mlp"``.
+        observation_key: where the observation is read.
+        latent_key: where the latent is written.
+
+    Raises:
+        ValueError: if a size is not positive or ``trunk`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> vae = VAE(20, 4)
+        >>> vae(TensorDict(observation=torch.zeros(3, 20), batch_size=3))["latent"].shape
+        torch.Size([3, 4])
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        latent_dim: int,
+        *,
+        trunk: Literal["linear", "mlp"] = "linear",
+        num_cells: Sequence[int] = (256, 256),
+        observation_key: NestedKey = "observation",
+        latent_key: NestedKey = "latent",
+    ) -> None:
+        super().__init__()
+        self.encoder = TensorDictModule(
+            _trunk(trunk, observation_dim, 2 * latent_dim, num_cells),
+            in_keys=[observation_key],
+            out_keys=["posterior"],
+        )
+        self.decoder = TensorDictModule(
+            _trunk(trunk, latent_dim, observation_dim, num_cells),
+            in_keys=[latent_key],
+            out_keys=["reconstruction"],
+        )
+        self.latent_dim = latent_dim
+        self.latent_key = latent_key
+        self.in_keys = [observation_key]
+        self.out_keys = [latent_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the mean of the posterior.
+
+        Args:
+            tensordict: holds the observation.
+
+        Returns:
+            The same tensordict with the latent.
+        """
+        posterior = self.encoder.module(tensordict.get(self.in_keys[0]))
+        return tensordict.set(self.latent_key, posterior[..., : self.latent_dim])
+
+
+class VAELoss(WindowLoss):
+    r"""Negative evidence lower bound of a :class:`VAE`.
+
+    .. math::
+        \mathcal L_{\text{VAE}} = \|x_t - \hat x_t\|^2
+        + \beta\, \mathrm{KL}\big(q(z_t \mid x_t) \,\|\, \mathcal N(0, I)\big)
+
+    with one reparameterised sample, summed over dimensions, mean over steps.
+
+    Entries: ``loss_reconstruction``, ``loss_kl``.
+
+    Args:
+        model: the model, or a list of models that train as one batch.
+        kl_coeff: :math:`\beta`.
+        stacked_data: whether the windows come with a leading dimension of models.
+        reduction: ``"mean"`` over steps, ``"sum"``, or ``"none"`` (``(B, T)``).
+
+    Raises:
+        ValueError: if ``kl_coeff`` is negative or not finite, or ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> loss = VAELoss(VAE(20, 4))
+        >>> sorted(loss(TensorDict(observation=torch.zeros(8, 5, 20), batch_size=(8, 5))).keys())
+        ['loss_kl', 'loss_reconstruction']
+    """
+
+    encoder: TensorDictModule
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    decoder: TensorDictModule
+    decoder_params: TensorDictParams
+    target_decoder_params: TensorDictParams
+
+    _schedulable_buffers = frozenset({"kl_coeff"})
+
+    def __init__(
+        self,
+        model: VAE | Sequence[VAE],
+        *,
+        kl_coeff: float = 1.0,
+        stacked_data: bool = False,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        super().__init__(
+            model,
+            {"encoder": "encoder", "decoder": "decoder"},
+            skips=(),
+            stacked_data=stacked_data,
+            reduction=reduction,
+        )
+        self._register_coeff("kl_coeff", kl_coeff)
+
+    def _loss_keys(self) -> Iterator[str]:
+        yield from ("loss_reconstruction", "loss_kl")
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+    ) -> dict[str, Tensor]:
+        encoder_params, decoder_params = params
+        observation = data.get(self.encoder.in_keys[0])
+        mask, length = masks.get("steps"), observation.shape[1]
+        with encoder_params.to_module(self.encoder):
+            mean, log_var = self.encoder.module(observation).chunk(2, dim=-1)
+        latent = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
+        with decoder_params.to_module(self.decoder):
+            error = (observation - self.decoder.module(latent)).pow(2).sum(-1)
+        kl = 0.5 * (log_var.exp() + mean.pow(2) - 1 - log_var).sum(-1)
+        return {
+            "loss_reconstruction": self._reduce([error], [mask], length),
+            "loss_kl": self.kl_coeff * self._reduce([kl], [mask], length),
+        }
+
+
+class PixelARLoss(WindowLoss):
     r"""Squared error of the next observation, :math:`\|x_{t+1} - \hat x_{t+1}\|^2`.
 
-    The objective of the paper's AR baseline. Pairs across the end of an episode and padded steps do not
-    count.
+    The objective of the paper's AR baseline: summed over dimensions, mean over pairs.
 
     Entries: ``loss_reconstruction``.
 
     Args:
-        model: the model.
-        reduction: ``"mean"`` over pairs, ``"sum"``, or ``"none"`` (``(B, T - 1)``, zero where a pair
-            does not count).
+        model: the model, or a list of models that train as one batch.
+        stacked_data: whether the windows come with a leading dimension of models.
+        reduction: ``"mean"`` over pairs, ``"sum"``, or ``"none"`` (``(B, T)``, zero where a pair does
+            not count).
 
     Raises:
         ValueError: if ``reduction`` is unknown.
@@ -200,105 +335,54 @@ class PixelARLoss(LossModule):
         tensor(0., grad_fn=...)
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that the loss itself reads.
-
-        Attributes:
-            done: end of an episode after this step. Defaults to ``("next", "done")``.
-            is_init: beginning of an episode at this step. Defaults to ``"is_init"``.
-        """
-
-        done: NestedKey = ("next", "done")
-        is_init: NestedKey = "is_init"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-
     encoder: TensorDictModuleBase
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
     decoder: PixelDecoder
     decoder_params: TensorDictParams
     target_decoder_params: TensorDictParams
-    out_keys = ["loss_reconstruction"]
 
-    def __init__(self, model: PixelAR, *, reduction: Literal["mean", "sum", "none"] = "mean") -> None:
-        super().__init__()
-        if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
-        self.reduction = reduction
-        self.convert_to_functional(model.encoder, "encoder")
-        self.convert_to_functional(model.predictor, "decoder")
-        self._set_in_keys()
+    def __init__(
+        self,
+        model: PixelAR | Sequence[PixelAR],
+        *,
+        stacked_data: bool = False,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        super().__init__(
+            model,
+            {"encoder": "encoder", "decoder": "predictor"},
+            skips=(1,),
+            stacked_data=stacked_data,
+            reduction=reduction,
+        )
 
-    def _set_in_keys(self) -> None:
-        keys = self.tensor_keys
-        self._in_keys = [
-            *self.encoder.in_keys,
-            *self.decoder.in_keys[1:],
-            keys.done,
-            keys.is_init,
-        ]
+    def _required_keys(self) -> list[NestedKey]:
+        return [self.encoder.in_keys[0], *self.decoder.in_keys[1:]]
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        self._set_in_keys()
+    def _loss_keys(self) -> Iterator[str]:
+        yield "loss_reconstruction"
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """What ``forward`` reads; ``done`` and ``is_init`` may be missing."""
-        return self._in_keys
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+    ) -> dict[str, Tensor]:
+        encoder_params, decoder_params = params
+        observation = data.get(self.encoder.in_keys[0])
+        latent = self._encode(data[:, :-1], encoder_params, self.decoder.latent_key)
+        action = data.get(self.decoder.action_key)[:, :-1] if self.decoder.action_dim else None
+        with decoder_params.to_module(self.decoder):
+            predicted = self.decoder.decode(latent, action)
+        error = (predicted - observation[:, 1:]).pow(2).sum(-1)
+        return {"loss_reconstruction": self._reduce([error], [masks.get("1")], observation.shape[1])}
 
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Loss of a batch of windows.
-
-        Args:
-            tensordict: the windows, ``(*B, T)``; not changed.
-
-        Returns:
-            A tensordict with ``loss_reconstruction``.
-
-        Raises:
-            KeyError: if an entry is missing.
-            ValueError: if the windows have fewer than two steps, a shape does not fit them, or a value that
-                counts is not finite.
-        """
-        name = type(self).__name__
-        observation_key = self.encoder.in_keys[0]
-        observation = read(tensordict, observation_key, reader=name)
-        batch = observation.shape[:-1]
-        if not batch or batch[-1] < 2:
-            raise ValueError(f"the windows must have at least 2 steps, got a batch {tuple(batch)}")
-        mask = step_mask(tensordict, self._loss_mask_keys(), batch)
-        check_finite(observation, mask, observation_key)
-        action = None
-        if self.decoder.action_dim:
-            action = read(tensordict, self.decoder.action_key, reader=name)
-            if action.shape[:-1] != batch:
-                raise ValueError(
-                    f"{self.decoder.action_key!r} must have shape {(*batch, self.decoder.action_dim)}, got "
-                    f"{tuple(action.shape)}"
-                )
-            check_finite(action, mask, self.decoder.action_key)
-        if mask is not None:
-            observation = torch.where(mask.unsqueeze(-1), observation, 0)
-            action = None if action is None else torch.where(mask.unsqueeze(-1), action, 0)
-        keys = self.tensor_keys
-        done, is_init = (step_mask(tensordict, [key], batch) for key in (keys.done, keys.is_init))
-        pairs = pair_mask(done, is_init, mask, 1)
-        context = TensorDict({observation_key: observation[..., :-1, :]}, (*batch[:-1], batch[-1] - 1))
-        with self.encoder_params.to_module(self.encoder):
-            latent = self.encoder(context).get(self.decoder.latent_key)
-        with self.decoder_params.to_module(self.decoder):
-            predicted = self.decoder.decode(latent, None if action is None else action[..., :-1, :])
-        error = (predicted - observation[..., 1:, :]).pow(2).sum(-1)
-        if pairs is not None and self.reduction == "none":
-            error, pairs = torch.where(pairs, error, 0), None
-        out = TensorDict({"loss_reconstruction": self._reduce_loss(error, mask=pairs)}, batch_size=[])
-        self._clear_weakrefs(tensordict, out, "encoder_params", "decoder_params")
-        return out
+def _trunk(
+    trunk: Literal["linear", "mlp"], in_features: int, out_features: int, num_cells: Sequence[int]
+) -> nn.Module:
+    if min(in_features, out_features) < 1:
+        raise ValueError(f"sizes must be positive, got {in_features} and {out_features}")
+    if trunk == "linear":
+        return nn.Linear(in_features, out_features, bias=False)
+    if trunk == "mlp":
+        return MLP(in_features, out_features, num_cells=list(num_cells))
+    raise ValueError(f"trunk must be 'linear' or 'mlp', got {trunk!r}")

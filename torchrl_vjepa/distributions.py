@@ -11,10 +11,16 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Normal, constraints
+from torch.distributions import (
+    Distribution,
+    Independent,
+    MultivariateNormal,
+    Normal,
+    constraints,
+)
 from torchrl.modules import Delta as _TorchRLDelta
 
-__all__ = ["Delta", "diag_gaussian", "point_estimate", "sample"]
+__all__ = ["Delta", "diag_gaussian", "point_estimate", "product_of_experts", "sample"]
 
 
 class Delta(_TorchRLDelta):
@@ -198,3 +204,58 @@ def point_estimate(
     if how == "sample":
         return sample(p, generator=generator)
     raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
+
+
+def product_of_experts(*experts: Distribution) -> Distribution:
+    r"""Normalised product of Gaussian densities (``eq:bjepa_posterior``), in precision space.
+
+    .. math::
+        \Lambda = \sum_i \Lambda_i, \qquad \mu = \Lambda^{-1} \sum_i \Lambda_i \mu_i
+
+    Diagonal experts alone give a diagonal product; with a full one among them it is full. For two of
+    them it is the Kalman update of one by the other as a measurement.
+
+    Args:
+        *experts: diagonal (:func:`diag_gaussian`) or full (``MultivariateNormal``) Gaussians with the
+            same event ``(D,)`` and batch shapes that broadcast.
+
+    Returns:
+        The product, with the broadcast batch shape.
+
+    Raises:
+        ValueError: if there is no expert or event shapes differ.
+        TypeError: if an expert is not Gaussian.
+
+    Examples:
+        >>> import torch
+        >>> likelihood = diag_gaussian(torch.zeros(5, 2), torch.ones(2))
+        >>> prior = diag_gaussian(torch.ones(2), torch.ones(2))
+        >>> product_of_experts(likelihood, prior).mean[0], product_of_experts(likelihood, prior).variance[0]
+        (tensor([0.5000, 0.5000]), tensor([0.5000, 0.5000]))
+    """
+    if not experts:
+        raise ValueError("experts must be at least one Gaussian, got none")
+    if len({p.event_shape for p in experts}) != 1:
+        shapes = [tuple(p.event_shape) for p in experts]
+        raise ValueError(f"experts must have the same event shape, got {shapes}")
+    diagonal = [p for p in experts if isinstance(p, Independent) and isinstance(p.base_dist, Normal)]
+    full = [p for p in experts if isinstance(p, MultivariateNormal)]
+    if len(diagonal) + len(full) != len(experts):
+        names = [type(p).__name__ for p in experts]
+        raise TypeError(f"experts must be diagonal or multivariate Gaussians, got {names}")
+    precision: Tensor | float = 0.0
+    weighted: Tensor | float = 0.0
+    for p in diagonal:
+        weight = p.base_dist.scale.pow(-2)
+        precision, weighted = precision + weight, weighted + weight * p.base_dist.loc
+    if not full:
+        precision, weighted = torch.as_tensor(precision), torch.as_tensor(weighted)
+        return diag_gaussian(weighted / precision, precision.rsqrt())
+    matrix = torch.diag_embed(precision) if isinstance(precision, Tensor) else 0.0
+    for gaussian in full:
+        matrix = matrix + gaussian.precision_matrix
+        weighted = weighted + (gaussian.precision_matrix @ gaussian.loc.unsqueeze(-1)).squeeze(-1)
+    matrix, weighted = torch.as_tensor(matrix), torch.as_tensor(weighted)
+    factor = torch.linalg.cholesky(matrix)
+    loc = torch.cholesky_solve(weighted.unsqueeze(-1), factor).squeeze(-1)
+    return MultivariateNormal(loc, precision_matrix=matrix, validate_args=False)

@@ -12,9 +12,10 @@ from torchrl.modules import WorldModelWrapper
 
 from torchrl_vjepa.distributions import diag_gaussian, point_estimate
 from torchrl_vjepa.heads import TargetScale
-from torchrl_vjepa.predictor import Predictor
+from torchrl_vjepa.predictor import FusedPredictor, Predictor
+from torchrl_vjepa.priors import GaussianPrior
 
-__all__ = ["JEPA", "LatentModel", "VJEPA"]
+__all__ = ["BJEPA", "JEPA", "LatentModel", "VJEPA"]
 
 
 class _PointTransition(nn.Module):
@@ -232,3 +233,66 @@ class VJEPA(JEPA):
             Diagonal Gaussian with batch ``*B`` and event ``(D,)``.
         """
         return diag_gaussian(latent, self.target_scale.module(observation))
+
+
+class BJEPA(VJEPA):
+    r"""Bayesian JEPA: the dynamics of a :class:`VJEPA` and a structural prior, fused by product of experts.
+
+    Trained by :class:`~torchrl_vjepa.objectives.BJEPALoss`; :meth:`fuse` gives the transition
+    :math:`p(Z_T \mid Z_C, \eta) \propto p_{\text{like}}(Z_T \mid Z_C)\, p_{\text{prior}}(Z_T \mid \eta)`
+    (``eq:bjepa_posterior``). As a module it writes what a VJEPA writes: the unfused prediction.
+
+    Args:
+        encoder: TensorDictModule that writes the latent.
+        predictor: the likelihood expert.
+        structural_prior: :math:`p_{\text{struct}}`; a learned static Gaussian that starts at
+            :math:`\mathcal N(0, I)` by default, as in the paper's experiment.
+        target_scale: see :class:`VJEPA`.
+        observation_key: see :class:`VJEPA`.
+
+    Raises:
+        ValueError: if encoder and predictor do not agree on the key of the latent.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa import GaussianPrior, Predictor, linear_encoder
+        >>> model = BJEPA(linear_encoder(20, 4), Predictor(4))
+        >>> model.fuse().dist(torch.ones(1, 4)).variance.max() < 1
+        tensor(True)
+        >>> goal = GaussianPrior(4, mean=torch.arange(4.0), std=1e-3)
+        >>> model.fuse(goal).dist(torch.zeros(1, 4)).mean.round()
+        tensor([[0., 1., 2., 3.]], grad_fn=...)
+    """
+
+    def __init__(
+        self,
+        encoder: TensorDictModuleBase,
+        predictor: Predictor,
+        *,
+        structural_prior: nn.Module | None = None,
+        target_scale: nn.Module | None = None,
+        observation_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(encoder, predictor, target_scale=target_scale, observation_key=observation_key)
+        if structural_prior is None:
+            structural_prior = GaussianPrior(predictor.latent_dim, learnable=True)
+        # A TensorDictModule, so that the loss can reset and stack its parameters like all others.
+        self.structural_prior_module = TensorDictModule(
+            structural_prior, in_keys=[], out_keys=["structural_prior"]
+        )
+
+    @property
+    def structural_prior(self) -> nn.Module:
+        """The prior that shapes the dynamics in training."""
+        return self.structural_prior_module.module
+
+    def fuse(self, prior: nn.Module | None = None) -> FusedPredictor:
+        """The dynamics, fused with a prior.
+
+        Args:
+            prior: the prior expert; the structural prior by default.
+
+        Returns:
+            A transition that shares its parameters with the model.
+        """
+        return FusedPredictor(self.predictor, self.structural_prior if prior is None else prior)

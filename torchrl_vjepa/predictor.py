@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.modules import MLP
 
-from torchrl_vjepa.distributions import point_estimate
+from torchrl_vjepa.distributions import point_estimate, product_of_experts
 from torchrl_vjepa.heads import DiagGaussianHead, Head
 from torchrl_vjepa.windows import read
 
-__all__ = ["Predictor"]
+__all__ = ["FusedPredictor", "Predictor"]
 
 
 class Predictor(TensorDictModuleBase):
@@ -253,3 +253,75 @@ class Predictor(TensorDictModuleBase):
         """
         p = self.dist_of(tensordict)
         return tensordict.set(self.out_keys[0], point_estimate(p, self.how))
+
+
+class FusedPredictor(TensorDictModuleBase):
+    r"""Hard fusion of the dynamics with a prior by product of experts (``eq:bjepa_posterior``).
+
+    :math:`p(Z_T \mid Z_C, \eta) \propto p_{\text{like}}(Z_T \mid Z_C)\, p_{\text{prior}}(Z_T \mid \eta)`,
+    in closed form for Gaussians. It is again a transition, with the attributes of the predictor.
+
+    Args:
+        predictor: the likelihood expert :math:`p_{\text{like}}`, with a Gaussian head.
+        prior: the prior expert: a callable that returns a Gaussian over latents, for instance a
+            :class:`~torchrl_vjepa.priors.GaussianPrior`. ``None`` is the flat prior: the predictor's own
+            distribution.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa import GaussianPrior
+        >>> fused = FusedPredictor(Predictor(4), GaussianPrior(4))
+        >>> fused.dist(torch.zeros(7, 4)).mean.shape
+        torch.Size([7, 4])
+    """
+
+    def __init__(self, predictor: Predictor, prior: Callable[[], Distribution] | None = None) -> None:
+        super().__init__()
+        self.predictor = predictor
+        self.prior = prior
+        for name in ("latent_dim", "action_dim", "side_info_dim", "skips", "how"):
+            setattr(self, name, getattr(predictor, name))
+        for name in ("latent_key", "action_key", "side_info_key"):
+            setattr(self, name, getattr(predictor, name))
+        self.in_keys, self.out_keys = list(predictor.in_keys), list(predictor.out_keys)
+
+    def dist(
+        self,
+        latent: Tensor,
+        action: Tensor | None = None,
+        *,
+        skip: int = 1,
+        side_info: Tensor | None = None,
+    ) -> Distribution:
+        """The fused distribution of the latent ``skip`` steps ahead.
+
+        Args:
+            latent: of shape ``(*B, D)``.
+            action: as for :meth:`Predictor.dist`.
+            skip: as for :meth:`Predictor.dist`.
+            side_info: as for :meth:`Predictor.dist`.
+
+        Returns:
+            Gaussian with batch ``*B`` and event ``(D,)``.
+        """
+        p = self.predictor.dist(latent, action, skip=skip, side_info=side_info)
+        return p if self.prior is None else product_of_experts(p, self.prior())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the one-step point prediction.
+
+        Args:
+            tensordict: holds ``latent`` and what else ``in_keys`` names.
+
+        Returns:
+            The same tensordict with the entry ``out_keys[0]``.
+        """
+        return tensordict.set(self.out_keys[0], point_estimate(_one_step(self, tensordict), self.how))
+
+
+def _one_step(predictor: Predictor | FusedPredictor, tensordict: TensorDictBase) -> Distribution:
+    return predictor.dist(
+        tensordict.get(predictor.latent_key),
+        tensordict.get(predictor.action_key) if predictor.action_dim else None,
+        side_info=tensordict.get(predictor.side_info_key) if predictor.side_info_dim else None,
+    )

@@ -1,8 +1,18 @@
 """The losses of the paper as TorchRL LossModules."""
 
 from torchrl_vjepa.objectives.base import CollapseWarning, LatentPredictionLoss
+from torchrl_vjepa.objectives.bjepa import BJEPALoss
 from torchrl_vjepa.objectives.jepa import JEPALoss
 from torchrl_vjepa.objectives.reward import RewardLoss
 from torchrl_vjepa.objectives.vjepa import VJEPALoss
+from torchrl_vjepa.objectives.window_loss import WindowLoss
 
-__all__ = ["CollapseWarning", "JEPALoss", "LatentPredictionLoss", "RewardLoss", "VJEPALoss"]
+__all__ = [
+    "BJEPALoss",
+    "CollapseWarning",
+    "JEPALoss",
+    "LatentPredictionLoss",
+    "RewardLoss",
+    "VJEPALoss",
+    "WindowLoss",
+]

@@ -19,16 +19,18 @@ class JEPALoss(LatentPredictionLoss):
     r"""Squared prediction error in latent space (``eq:JEPA_squared_loss``).
 
     .. math::
-        \mathcal L_{\text{JEPA}} = \frac{1}{|\Delta|} \sum_\Delta \mathbb E\,
+        \mathcal L_{\text{JEPA}} = \sum_\Delta w_\Delta\, \mathbb E\,
         \big\| g_\phi(f_\theta(x_t), u_{t:t+\Delta-1}) - f_{\theta'}(x_{t+\Delta}) \big\|^2
 
     where :math:`g_\phi` is the predictive mean. The paper's JEPA adds VICReg: ``prediction_coeff=25/D``
     (VICReg averages the square over the D dimensions), ``variance_coeff=25``, ``covariance_coeff=1``.
 
-    Entries: ``loss_prediction``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``; diagnostics ``effective_rank``, ``latent_std``, ``error_skip_<k>``.
+    Entries: ``loss_prediction``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``; diagnostics
+    ``effective_rank``, ``latent_std``, ``error_skip_<k>``.
 
     Args:
         model: the model, or a list of models that train as one batch (:class:`LatentPredictionLoss`).
+        skip_weights: one weight for each skip of the predictor; equal by default.
         stacked_data: whether the windows come with a leading dimension of models.
         prediction_coeff: weight of the squared error.
         variance_coeff: weight of VICReg's variance term.
@@ -62,6 +64,7 @@ class JEPALoss(LatentPredictionLoss):
         self,
         model: JEPA | Sequence[JEPA],
         *,
+        skip_weights: Sequence[float] | None = None,
         stacked_data: bool = False,
         prediction_coeff: float = 1.0,
         variance_coeff: float = 0.0,
@@ -72,6 +75,7 @@ class JEPALoss(LatentPredictionLoss):
     ) -> None:
         super().__init__(
             model,
+            skip_weights=skip_weights,
             stacked_data=stacked_data,
             variance_coeff=variance_coeff,
             covariance_coeff=covariance_coeff,
@@ -86,6 +90,7 @@ class JEPALoss(LatentPredictionLoss):
         yield from super()._loss_keys()
 
     def _diagnostic_keys(self) -> Iterator[str]:
+        yield from super()._diagnostic_keys()
         yield from (f"error_skip_{skip}" for skip in self.predictor.skips)
 
     def _member_terms(
@@ -94,10 +99,10 @@ class JEPALoss(LatentPredictionLoss):
         target_latent: Tensor,
         data: TensorDictBase,
         mask: Tensor | None,
-        params: TensorDictBase,
+        params: dict[str, TensorDictBase],
     ) -> dict[str, Tensor]:
         errors = [(pair.dist.mean - pair.target).pow(2).sum(-1) for pair in pairs]
-        terms = {"loss_prediction": self.prediction_coeff * self._reduce(errors, pairs)}
+        terms = {"loss_prediction": self.prediction_coeff * self._reduce_pairs(errors, pairs)}
         for pair, error in zip(pairs, errors, strict=True):
             terms[f"error_skip_{pair.skip}"] = pair.mean(error).detach()
         return terms

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
 from torchrl_vjepa.belief import rollout
 from torchrl_vjepa.models import LatentModel
-from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
+from torchrl_vjepa.objectives.window_loss import WindowLoss
 
 __all__ = ["RewardLoss"]
 
 
-class RewardLoss(LossModule):
+class RewardLoss(WindowLoss):
     r"""Squared error of a reward head on *predicted* latents.
 
     The head is asked what the planner will ask it: the reward of :math:`(\hat Z_{t+k}, u_{t+k-1})`
@@ -30,11 +31,10 @@ class RewardLoss(LossModule):
 
     Args:
         model: the trained (or training) model; parameters stay its own.
-        reward_model: TensorDictModule that reads the next latent and the action and writes the reward;
-            its out key must be the key under which ``("next", ...)`` holds the true reward.
+        reward_model: TensorDictModule that reads the next latent and the action and writes the reward.
         num_steps: length of the imagined rollouts.
         train_model: whether the gradient flows into encoder and predictor too.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``(B, T - num_steps + 1)``).
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``(B, T)``, zero where no rollout starts).
 
     Raises:
         ValueError: if ``num_steps`` is not positive or ``reduction`` is unknown.
@@ -60,7 +60,7 @@ class RewardLoss(LossModule):
     """
 
     @dataclass
-    class _AcceptedKeys:
+    class _AcceptedKeys(WindowLoss._AcceptedKeys):
         """Keys that the loss itself reads.
 
         Attributes:
@@ -70,8 +70,6 @@ class RewardLoss(LossModule):
         """
 
         reward: NestedKey = ("next", "reward")
-        done: NestedKey = ("next", "done")
-        is_init: NestedKey = "is_init"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -95,114 +93,65 @@ class RewardLoss(LossModule):
         train_model: bool = False,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        super().__init__()
         if num_steps < 1:
             raise ValueError(f"num_steps must be positive, got {num_steps}")
-        if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
+        parts = SimpleNamespace(reward_model=reward_model, encoder=model.encoder, predictor=model.predictor)
+        names = ["reward_model", *(["encoder", "predictor"] if train_model else [])]
+        super().__init__(
+            parts,
+            {name: name for name in names},
+            skips=(num_steps - 1,) if num_steps > 1 else (),
+            reduction=reduction,
+        )
         self.num_steps = num_steps
         self.train_model = train_model
-        self.reduction = reduction
-        self.convert_to_functional(reward_model, "reward_model")
-        if train_model:
-            self.convert_to_functional(model.encoder, "encoder")
-            self.convert_to_functional(model.predictor, "predictor")
-        # Not registered: without train_model its parameters are not the loss's to list or to save.
-        self.__dict__["model"] = model
-        self._set_in_keys()
-        self._out_keys: list[NestedKey] | None = None
-
-    def _set_in_keys(self) -> None:
-        keys = self.tensor_keys
-        model: LatentModel = self.__dict__["model"]
-        self._in_keys = [*model.in_keys, keys.reward, keys.done, keys.is_init]
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        if not train_model:
+            # Not registered: the model's parameters are not the loss's to list or to save.
+            self.__dict__["encoder"] = model.encoder
+            self.__dict__["predictor"] = model.predictor
         self._set_in_keys()
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """What ``forward`` reads; ``done`` and ``is_init`` may be missing."""
-        return self._in_keys
+    def _required_keys(self) -> list[NestedKey]:
+        if "encoder" not in self.__dict__:  # while the parent is being built
+            return []
+        predictor = self.predictor
+        action = [predictor.action_key] if predictor.action_dim else []
+        return [self.encoder.in_keys[0], *action, self.tensor_keys.reward]
 
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
+    def _optional_keys(self) -> list[NestedKey]:
+        return super()._optional_keys() if "encoder" in self.__dict__ else []
 
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """``loss_reward`` and, unless ``reduction="none"``, ``reward_error``."""
-        if self._out_keys is not None:
-            return self._out_keys
-        return ["loss_reward"] if self.reduction == "none" else ["loss_reward", "reward_error"]
+    def _loss_keys(self) -> Iterator[str]:
+        yield "loss_reward"
 
-    @out_keys.setter
-    def out_keys(self, keys: list[NestedKey]) -> None:
-        self._out_keys = keys
+    def _diagnostic_keys(self) -> Iterator[str]:
+        yield "reward_error"
 
-    def _imagine(self, data: TensorDictBase, action: Tensor) -> Tensor:
-        model: LatentModel = self.__dict__["model"]
-        with torch.set_grad_enabled(self.train_model and torch.is_grad_enabled()):
-            latent = model.encoder(data.copy()).get(model.latent_key)
-            starts = latent[:, : latent.shape[1] - self.num_steps + 1]
-            return rollout(model.predictor.dist, starts, action)
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Loss of a batch of windows.
-
-        Args:
-            tensordict: the windows, ``(*B, T)``; not changed.
-
-        Returns:
-            A tensordict with ``loss_reward`` and the diagnostic ``reward_error``.
-
-        Raises:
-            KeyError: if an entry is missing.
-            ValueError: if the window is shorter than ``num_steps``, the head writes another shape than
-                the reward's, or a value that counts is not finite.
-        """
-        model: LatentModel = self.__dict__["model"]
-        keys = self.tensor_keys
-        name = type(self).__name__
-        reward = read(tensordict, keys.reward, reader=name)
-        action = read(tensordict, model.action_key, reader=name)
-        batch = reward.shape[:-1]
-        if not batch or batch[-1] < self.num_steps:
-            raise ValueError(
-                f"the windows must have at least num_steps={self.num_steps} steps, got a batch of shape "
-                f"{tuple(batch)}"
-            )
-        mask = step_mask(tensordict, self._loss_mask_keys(), batch)
-        entries = {
-            key: value
-            for key in (*model.encoder.in_keys, keys.done)
-            if (value := tensordict.get(key, None)) is not None
-        }
-        observation_key = model.encoder.in_keys[0]
-        read(tensordict, observation_key, reader=name)
-        if not torch.compiler.is_compiling():
-            for key, value in (
-                (observation_key, entries[observation_key]),
-                (model.action_key, action),
-            ):
-                check_finite(value, mask, key)
-            check_finite(reward, mask, keys.reward)
-        if mask is not None:
-            keep = mask.unsqueeze(-1)
-            entries[observation_key] = torch.where(keep, entries[observation_key], 0)
-            action, reward = torch.where(keep, action, 0), torch.where(keep, reward, 0)
-            mask = mask.reshape(-1, batch[-1])
-        data = TensorDict(entries, batch_size=batch).reshape(-1, batch[-1])
+    def _imagine(self, data: TensorDictBase, chunks: Tensor | None) -> Tensor:
+        """Latents ``(B, N, num_steps, D)`` rolled out from each of the N first steps."""
         steps = self.num_steps
-        action = action.reshape(-1, batch[-1], action.shape[-1]).unfold(1, steps, 1).transpose(-1, -2)
-        reward = reward.reshape(-1, batch[-1], 1).unfold(1, steps, 1).transpose(-1, -2)
+        with torch.set_grad_enabled(self.train_model and torch.is_grad_enabled()):
+            latent = self.encoder(data.copy()).get(self.predictor.latent_key)
+            starts = latent[:, : latent.shape[1] - steps + 1]
+            if chunks is None:
+                chunks = starts.new_zeros(*starts.shape[:-1], steps, 0)
+                return rollout(lambda z, _: self.predictor.dist(z), starts, chunks)
+            return rollout(self.predictor.dist, starts, chunks)
 
-        latents = self._imagine(data, action)
-        imagined = TensorDict(
-            {model.latent_key: latents, model.action_key: action}, batch_size=latents.shape[:-1]
-        )
-        with self.reward_model_params.to_module(self.reward_model):
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+    ) -> dict[str, Tensor]:
+        steps, length = self.num_steps, data.shape[1]
+        reward = data.get(self.tensor_keys.reward).unfold(1, steps, 1).transpose(-1, -2)
+        chunks = None
+        if self.predictor.action_dim:
+            action = data.get(self.predictor.action_key)
+            chunks = action.unfold(1, steps, 1).transpose(-1, -2)
+        latents = self._imagine(data, chunks)
+        imagined = TensorDict({self.predictor.latent_key: latents}, batch_size=latents.shape[:-1])
+        if chunks is not None:
+            imagined.set(self.predictor.action_key, chunks)
+        with params[0].to_module(self.reward_model):
             predicted = self.reward_model(imagined).get(self.reward_model.out_keys[0])
         if predicted.shape != reward.shape:
             raise ValueError(
@@ -210,24 +159,11 @@ class RewardLoss(LossModule):
                 f"got {tuple(predicted.shape)}"
             )
         error = (predicted - reward).squeeze(-1)
-        counts: Tensor | None = self._rollout_mask(tensordict, mask, batch)
-        squared = error.pow(2).mean(-1)
-        if self.reduction == "none" and counts is not None:
-            squared, counts = torch.where(counts, squared, 0), None
-        out = TensorDict({"loss_reward": self._reduce_loss(squared, mask=counts)}, batch_size=[])
+        mask = masks.get(str(steps - 1) if steps > 1 else "steps")
+        terms = {"loss_reward": self._reduce([error.pow(2).mean(-1)], [mask], length)}
         if self.reduction != "none":
-            out["reward_error"] = self._reduce_loss(
-                error.detach().abs().mean(-1), mask=counts, reduction="mean"
-            )
-        self._clear_weakrefs(tensordict, out, "reward_model_params")
-        return out
-
-    def _rollout_mask(
-        self, tensordict: TensorDictBase, mask: Tensor | None, batch: torch.Size
-    ) -> Tensor | None:
-        """Rollouts that stay in one episode: steps ``t .. t + num_steps - 1`` are joined."""
-        flags = [tensordict.get(key, None) for key in (self.tensor_keys.done, self.tensor_keys.is_init)]
-        flags = [None if flag is None else flag.reshape(-1, batch[-1]) for flag in flags]
-        if self.num_steps == 1:
-            return mask
-        return pair_mask(flags[0], flags[1], mask, self.num_steps - 1)
+            absolute = error.detach().abs().mean(-1)
+            if mask is not None:
+                absolute = absolute[mask]
+            terms["reward_error"] = absolute.sum() / max(absolute.numel(), 1)
+        return terms

@@ -24,7 +24,7 @@ class VJEPALoss(LatentPredictionLoss):
     r"""Regularised negative log-likelihood in latent space (``eq:vjepa_objective``).
 
     .. math::
-        \mathcal L_{\text{VJEPA}} = \frac{1}{|\Delta|} \sum_\Delta
+        \mathcal L_{\text{VJEPA}} = \sum_\Delta w_\Delta\,
         \mathbb E_{Z_T \sim q_{\theta'}(\cdot \mid x_{t+\Delta})}
         \big[-\log p_\phi(Z_T \mid Z_t, u_{t:t+\Delta-1})\big]
         + \beta\, \mathbb E\, \mathrm{KL}\big(q_{\theta'}(Z_T \mid x_T) \,\|\, \mathcal N(0, I)\big)
@@ -43,6 +43,7 @@ class VJEPALoss(LatentPredictionLoss):
 
     Args:
         model: the model, or a list of models that train as one batch (:class:`LatentPredictionLoss`).
+        skip_weights: one weight for each skip of the predictor; equal by default.
         stacked_data: whether the windows come with a leading dimension of models.
         target_kl_coeff: :math:`\beta`.
         target_scale_gradient: what moves the scale of the target: ``"kl"``: the KL term alone (the
@@ -95,6 +96,8 @@ class VJEPALoss(LatentPredictionLoss):
         self,
         model: VJEPA | Sequence[VJEPA],
         *,
+        modules: dict[str, str] | None = None,
+        skip_weights: Sequence[float] | None = None,
         stacked_data: bool = False,
         target_kl_coeff: float = 0.01,
         target_scale_gradient: Literal["kl", "both", "none"] = "kl",
@@ -116,6 +119,9 @@ class VJEPALoss(LatentPredictionLoss):
             raise ValueError("model must be a VJEPA or a list of them; for a JEPA use JEPALoss")
         super().__init__(
             model,
+            # Not named target_scale: SoftUpdate would take it for the target of "scale".
+            modules={"scale": "target_scale", **(modules or {})},
+            skip_weights=skip_weights,
             stacked_data=stacked_data,
             variance_coeff=variance_coeff,
             covariance_coeff=covariance_coeff,
@@ -126,12 +132,6 @@ class VJEPALoss(LatentPredictionLoss):
         self._register_coeff("target_kl_coeff", target_kl_coeff)
         self.target_scale_gradient = target_scale_gradient
         self.residual_variance = residual_variance
-        # Not named target_scale: SoftUpdate would take it for the target of "scale".
-        self._functional("scale", [m.target_scale for m in models if isinstance(m, VJEPA)])
-
-    def _stacked_modules(self, model: JEPA) -> list[tuple[str, TensorDictModuleBase]]:
-        modules = super()._stacked_modules(model)
-        return [*modules, ("scale", model.target_scale)] if isinstance(model, VJEPA) else modules
 
     def _loss_keys(self) -> Iterator[str]:
         yield from ("loss_nll", "loss_target_kl")
@@ -140,19 +140,17 @@ class VJEPALoss(LatentPredictionLoss):
         yield from super()._loss_keys()
 
     def _diagnostic_keys(self) -> Iterator[str]:
+        yield from super()._diagnostic_keys()
         yield from ("target_std", "mutual_information")
         yield from (f"nll_skip_{skip}" for skip in self.predictor.skips)
 
-    def _member_params(self) -> TensorDictBase:
-        return self.scale_params
-
-    def _target_std(self, data: TensorDictBase, params: TensorDictBase) -> Tensor:
-        with params.to_module(self.scale):
+    def _target_std(self, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
+        with params["scale"].to_module(self.scale):
             std = self.scale.module(data.get(self.scale.in_keys[0]))
         std = std.float() if std.dtype in (torch.float16, torch.bfloat16) else std
         return std.detach() if self.target_scale_gradient == "none" else std
 
-    def _target(self, latent: Tensor, data: TensorDictBase, params: TensorDictBase) -> Tensor:
+    def _target(self, latent: Tensor, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
         std = self._target_std(data, params)
         if self.target_scale_gradient != "both":
             std = std.detach()
@@ -164,7 +162,7 @@ class VJEPALoss(LatentPredictionLoss):
         target_latent: Tensor,
         data: TensorDictBase,
         mask: Tensor | None,
-        params: TensorDictBase,
+        params: dict[str, TensorDictBase],
     ) -> dict[str, Tensor]:
         terms = {}
         if self.residual_variance == "head":
@@ -177,21 +175,22 @@ class VJEPALoss(LatentPredictionLoss):
                 ).log_prob(pair.target.detach())
                 for pair in pairs
             ]
-            terms["loss_head"] = self._reduce(head_nlls, pairs)
-        terms["loss_nll"] = self._reduce(nlls, pairs)
+            terms["loss_head"] = self._reduce_pairs(head_nlls, pairs)
+        terms["loss_nll"] = self._reduce_pairs(nlls, pairs)
 
         # KL(q || N(0, I)) per step; every step that counts is some pair's target or could be.
         std = self._target_std(data, params)
         variance = std.pow(2)
         kl = 0.5 * (variance + target_latent.pow(2) - 1 - variance.log()).sum(-1)
-        terms["loss_target_kl"] = self.target_kl_coeff * self._reduce_steps(kl, mask)
+        terms["loss_target_kl"] = self.target_kl_coeff * self._reduce([kl], [mask], kl.shape[1])
 
         if self.reduction != "none":
             with torch.no_grad():
                 means = [pair.mean(nll) for pair, nll in zip(pairs, nlls, strict=True)]
                 terms["target_std"] = std.mean()
                 _, covariance = masked_moments(pairs[0].target, pairs[0].mask)
-                terms["mutual_information"] = covariance_entropy(covariance) - torch.stack(means).mean()
+                nll = sum(w * m for w, m in zip(self.skip_weights, means, strict=True))
+                terms["mutual_information"] = covariance_entropy(covariance) - nll
                 for pair, head_nll in zip(pairs, head_nlls, strict=True):
                     terms[f"nll_skip_{pair.skip}"] = pair.mean(head_nll).detach()
         return terms
@@ -210,12 +209,3 @@ class VJEPALoss(LatentPredictionLoss):
             precision = torch.linalg.inv(covariance)
             constant = torch.logdet(covariance) + covariance.shape[-1] * math.log(2 * math.pi)
         return 0.5 * ((residual @ precision * residual).sum(-1) + constant)
-
-    def _reduce_steps(self, value: Tensor, mask: Tensor | None) -> Tensor:
-        if mask is not None:
-            value = torch.where(mask, value, 0)
-        if self.reduction == "none":
-            return value
-        if self.reduction == "sum":
-            return value.sum()
-        return value.mean() if mask is None else value.sum() / mask.sum().clamp_min(1)

@@ -1,0 +1,346 @@
+"""Losses over windows of a replay buffer, for one model or for several as one batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
+
+__all__ = ["WindowLoss"]
+
+
+class WindowLoss(LossModule):
+    r"""Parent of the losses that read windows ``(*B, T)``, time last.
+
+    Windows are what :class:`~torchrl.data.SliceSampler` gives after ``batch.reshape(-1, T)``; a flat
+    batch whose slices end with ``done`` works too. Pairs of steps across the end of an episode
+    (``("next", "done")`` or ``is_init``) and padded steps (``loss_mask_key``) count nowhere.
+
+    **Several models as one batch.** Given a list of models of the same architecture, the loss trains all
+    of them at once (stacked parameters, ``torch.func.vmap``): its entries get a leading dimension, one
+    number for each model, and their sum gives every model exactly the gradient that it has alone; with
+    Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
+    are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
+    trained one back. This is how restarts and ensembles are trained.
+
+    Args:
+        model: the model, or a list of models.
+        modules: names of the parts of a model whose parameters the loss takes, and the attribute of the
+            model that holds each.
+        targets: the names that get target parameters.
+        skips: the distances of the pairs that the loss forms.
+        skip_weights: one non-negative weight for each skip, normalised to sum to one; equal by default.
+        stacked_data: whether the windows come with a leading dimension of models, ``(N, *B, T)``, one
+            batch for each model of the list; otherwise all models see the same batch.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+
+    Raises:
+        ValueError: if the list is empty, ``stacked_data`` is set for a single model, or ``reduction`` is
+            unknown.
+
+    Examples:
+        >>> from torchrl_vjepa import PixelARLoss, VJEPALoss
+        >>> issubclass(VJEPALoss, WindowLoss), issubclass(PixelARLoss, WindowLoss)
+        (True, True)
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that the loss itself reads; those of the model are renamed in its modules.
+
+        Attributes:
+            done: end of an episode after this step. Defaults to ``("next", "done")``.
+            is_init: beginning of an episode at this step. Defaults to ``"is_init"``.
+        """
+
+        done: NestedKey = ("next", "done")
+        is_init: NestedKey = "is_init"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    _vmap_randomness = "same"
+
+    def __init__(
+        self,
+        model: Any,
+        modules: dict[str, str],
+        *,
+        targets: Sequence[str] = (),
+        skips: Sequence[int] = (1,),
+        skip_weights: Sequence[float] | None = None,
+        stacked_data: bool = False,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+    ) -> None:
+        super().__init__()
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
+        several = isinstance(model, Sequence)
+        models = list(model) if several else [model]
+        if not models:
+            raise ValueError("model must be a model or a non-empty list of models, got an empty list")
+        if stacked_data and not several:
+            raise ValueError("stacked_data=True needs a list of models, got a single model")
+        self.num_models = len(models) if several else None
+        self.stacked_data = stacked_data
+        self.reduction = reduction
+        self.skips = tuple(skips)
+        self.skip_weights = _normalised(skip_weights, self.skips)
+        self.__dict__["_models"] = models
+        self._modules_of_model = dict(modules)
+        for name, attribute in modules.items():
+            parts = [getattr(m, attribute) for m in models]
+            self.convert_to_functional(
+                parts if several else parts[0],
+                name,
+                expand_dim=len(parts) if several else None,
+                create_target_params=name in targets,
+            )
+        self._set_in_keys()
+        self._out_keys: list[NestedKey] | None = None
+
+    def _register_coeff(self, name: str, value: float) -> None:
+        if not (math.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must be finite and at least 0, got {value}")
+        self.register_coeff_buffer(name, value)
+
+    # TorchRL's conventions
+
+    def _set_in_keys(self) -> None:
+        keys = [*self._required_keys(), *self._optional_keys()]
+        self._in_keys = list(dict.fromkeys(keys))
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        self._set_in_keys()
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What ``forward`` reads; ``done`` and ``is_init`` may be missing."""
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What ``forward`` writes: ``loss_*``, then diagnostics."""
+        if self._out_keys is not None:
+            return self._out_keys
+        diagnostics = () if self.reduction == "none" else self._diagnostic_keys()
+        return [*self._loss_keys(), *diagnostics]
+
+    @out_keys.setter
+    def out_keys(self, keys: list[NestedKey]) -> None:
+        self._out_keys = keys
+
+    # What a member adds
+
+    def _required_keys(self) -> list[NestedKey]:
+        """Floating-point entries that ``forward`` needs: the observation first."""
+        return [self.encoder.in_keys[0]]
+
+    def _optional_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        return [*self.encoder.in_keys[1:], keys.done, keys.is_init]
+
+    def _loss_keys(self) -> Iterator[str]:
+        yield from ()
+
+    def _diagnostic_keys(self) -> Iterator[str]:
+        yield from ()
+
+    def _params(self) -> tuple[TensorDictBase, ...]:
+        """The parameters that ``_terms`` takes, stacked if there are several models."""
+        return tuple(getattr(self, f"{name}_params") for name in self._modules_of_model)
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """The ``loss_*`` entries and diagnostics of one model on windows ``(B, T)``."""
+        raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
+
+    # The computation
+
+    def get_model(self, index: int | None = None) -> Any:
+        """The model with its trained parameters.
+
+        Args:
+            index: which one, if the loss was given a list: its parameters are copied from the stack
+                into the model that stood at this place.
+
+        Returns:
+            The model that was given to the constructor.
+
+        Raises:
+            ValueError: if ``index`` is missing for a list, given for a single model, or out of range.
+        """
+        models: list[Any] = self.__dict__["_models"]
+        if self.num_models is None:
+            if index is not None:
+                raise ValueError(f"index must be None for a single model, got {index}")
+            return models[0]
+        if index is None or not 0 <= index < self.num_models:
+            raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
+        for name, attribute in self._modules_of_model.items():
+            stacked = getattr(self, f"{name}_params").data[index]
+            TensorDict.from_module(getattr(models[index], attribute)).data.update_(stacked)
+        return models[index]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Losses and diagnostics of a batch of windows.
+
+        Args:
+            tensordict: the windows, ``(*B, T)``, with the entries of ``in_keys``; not changed.
+
+        Returns:
+            A tensordict with entries ``loss_*`` (their sum is the objective) and detached diagnostics;
+            scalars, or of shape ``(num_models,)``.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if a window is too short, shapes disagree, or a value that counts is not finite.
+        """
+        data, masks = self._read(tensordict)
+        params = self._params()
+        if self.num_models is None:
+            terms = self._terms(data, masks, *params)
+        else:
+            in_dim = 0 if self.stacked_data else None
+            terms = torch.vmap(
+                self._terms,
+                in_dims=(in_dim, in_dim, *[0] * len(params)),
+                randomness=self._vmap_randomness,
+            )(data, masks, *params)
+        terms = {key: terms[key] for key in self.out_keys}
+        self._watch(terms)
+        out = TensorDict(terms, batch_size=[])
+        self._clear_weakrefs(tensordict, out, *[f"{name}_params" for name in self._modules_of_model])
+        return out
+
+    def _watch(self, terms: dict[str, Tensor]) -> None:
+        """Called with the terms of all models."""
+
+    def _read(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, dict[str, Tensor]]:
+        """Checked windows ``(B, T)`` and the masks of steps (``"steps"``) and pairs (``"<skip>"``)."""
+        name = type(self).__name__
+        required = self._required_keys()
+        entries = {key: read(tensordict, key, reader=name) for key in required}
+        observation = entries[required[0]]
+        # dispatch() guesses the batch size wrongly where sizes agree by chance: read it off the data.
+        event_dims = 1 if len(required) > 1 else observation.ndim - tensordict.ndim
+        batch = entries[required[-1]].shape[: -event_dims or None]
+        if not batch:
+            raise ValueError(
+                f"the input must be windows of shape (*B, T), got a batch of shape {tuple(batch)}"
+            )
+        if self.stacked_data and (len(batch) < 2 or batch[0] != self.num_models):
+            raise ValueError(
+                f"stacked_data=True needs windows of shape ({self.num_models}, *B, T), one batch for each "
+                f"model, got {tuple(batch)}"
+            )
+        lead = (batch[0],) if self.stacked_data else ()
+        shape = (*lead, -1, batch[-1])
+        for key, value in entries.items():
+            if value.shape[: len(batch)] != batch or value.ndim == len(batch):
+                raise ValueError(
+                    f"{key!r} must have shape {(*batch, '...')} like {required[-1]!r}, "
+                    f"got {tuple(value.shape)}"
+                )
+            if not value.is_floating_point():
+                raise ValueError(
+                    f"{key!r} must be floating point, got {value.dtype}; convert it first "
+                    "(ToTensorImage, DoubleToFloat or one-hot actions)"
+                )
+        longest = max(self.skips, default=0)
+        if batch[-1] <= longest:
+            raise ValueError(
+                f"the windows must be longer than the largest skip {longest}, got T={batch[-1]}; "
+                "sample longer slices (slice_len) or drop that skip"
+            )
+        # What an encoder with memory may read besides: state and beginnings of episodes.
+        for key in (*self.encoder.in_keys[1:], self.tensor_keys.done):
+            value = tensordict.get(key, None)
+            if value is not None:
+                entries[key] = value.reshape(*batch, *value.shape[len(batch) :])
+        mask = step_mask(tensordict, self._loss_mask_keys(), batch)
+        flags = [tensordict.get(key, None) for key in (self.tensor_keys.done, self.tensor_keys.is_init)]
+        for i, flag in enumerate(flags):
+            if flag is not None:
+                if flag.shape not in (batch, (*batch, 1)):
+                    raise ValueError(
+                        f"{('done', 'is_init')[i]} must have shape {tuple(batch)} or {(*batch, 1)}, "
+                        f"got {tuple(flag.shape)}"
+                    )
+                flags[i] = flag.reshape(shape)
+        if not torch.compiler.is_compiling():
+            for key in required:
+                check_finite(entries[key], mask, key)
+        if mask is not None:
+            # Padding may hold anything: NaN times zero would still be NaN.
+            for key in required:
+                value = entries[key]
+                keep = mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
+                entries[key] = torch.where(keep, value, 0)
+            mask = mask.reshape(shape)
+        masks = {str(skip): pair_mask(flags[0], flags[1], mask, skip) for skip in self.skips}
+        masks["steps"] = mask
+        data = TensorDict(entries, batch_size=batch).reshape(shape)
+        return data, {key: value for key, value in masks.items() if value is not None}
+
+    def _encode(self, data: TensorDictBase, params: TensorDictBase, latent_key: NestedKey) -> Tensor:
+        """Latents ``(B, T, D)``, in float32 under autocast."""
+        with params.to_module(self.encoder):
+            latent = self.encoder(data.copy()).get(latent_key)
+        return latent.float() if latent.dtype in (torch.float16, torch.bfloat16) else latent
+
+    def _reduce(self, values: list[Tensor], masks: list[Tensor | None], length: int) -> Tensor:
+        """Reduce one number for each pair (or step), over pairs and skips, as ``reduction`` says.
+
+        Args:
+            values: for each skip ``(B, T - skip)``.
+            masks: those that count, or ``None`` for all.
+            length: ``T``.
+
+        Returns:
+            A scalar, or ``(B, T)`` for ``"none"``, zero where nothing counts. Several entries are
+            averaged with ``skip_weights``.
+        """
+        rows = []
+        weights = self.skip_weights if len(values) == len(self.skips) else (1.0,)
+        for value, mask in zip(values, masks, strict=True):
+            if mask is not None:
+                value = torch.where(mask, value, 0)
+            if self.reduction == "none":
+                rows.append(torch.nn.functional.pad(value, (0, length - value.shape[1])))
+            elif self.reduction == "sum" or mask is None:
+                rows.append(value.sum() if self.reduction == "sum" else value.mean())
+            else:
+                rows.append(value.sum() / mask.sum().clamp_min(1))
+        return sum(
+            (weight * row for weight, row in zip(weights[1:], rows[1:], strict=True)), weights[0] * rows[0]
+        )
+
+
+def _normalised(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
+    if weights is None:
+        return tuple(1.0 / len(skips) for _ in skips)
+    if (
+        len(weights) != len(skips)
+        or not all(math.isfinite(w) and w >= 0 for w in weights)
+        or not sum(weights)
+    ):
+        raise ValueError(
+            f"skip_weights must be one finite weight of at least 0 for each of skips={skips}, not all zero, "
+            f"got {tuple(weights)}"
+        )
+    return tuple(float(w) / sum(weights) for w in weights)
