@@ -266,7 +266,7 @@ class PixelARLoss(LossModule):
         Raises:
             KeyError: if an entry is missing.
             ValueError: if the windows have fewer than two steps, a shape does not fit them, or a value that
-                counts is not finite.
+                counts is not finite (not looked for under ``torch.compile``).
         """
         name = type(self).__name__
         observation_key = self.encoder.in_keys[0]
@@ -275,7 +275,10 @@ class PixelARLoss(LossModule):
         if not batch or batch[-1] < 2:
             raise ValueError(f"the windows must have at least 2 steps, got a batch {tuple(batch)}")
         mask = step_mask(tensordict, self._loss_mask_keys(), batch)
-        check_finite(observation, mask, observation_key)
+        # Looking at values would break the graph.
+        checking = not torch.compiler.is_compiling()
+        if checking:
+            check_finite(observation, mask, observation_key)
         action = None
         if self.decoder.action_dim:
             action = read(tensordict, self.decoder.action_key, reader=name)
@@ -284,7 +287,8 @@ class PixelARLoss(LossModule):
                     f"{self.decoder.action_key!r} must have shape {(*batch, self.decoder.action_dim)}, got "
                     f"{tuple(action.shape)}"
                 )
-            check_finite(action, mask, self.decoder.action_key)
+            if checking:
+                check_finite(action, mask, self.decoder.action_key)
         if mask is not None:
             observation = torch.where(mask.unsqueeze(-1), observation, 0)
             action = None if action is None else torch.where(mask.unsqueeze(-1), action, 0)
