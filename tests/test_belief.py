@@ -48,15 +48,11 @@ def _problem(*batch: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("how", ["mean", "mode"])
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_point_rollout_equals_matrix_powers(
-    system: LinearGaussian, how: str, batch: tuple[int, ...]
-) -> None:
+def test_point_rollout_equals_matrix_powers(system: LinearGaussian, how: str, batch: tuple[int, ...]) -> None:
     latent, actions = _problem(*batch)
     out = rollout(system, latent, actions, how)
     assert out.shape == (*batch, H, D)
-    rows = zip(
-        latent.reshape(-1, D), actions.reshape(-1, H, A), out.reshape(-1, H, D), strict=True
-    )
+    rows = zip(latent.reshape(-1, D), actions.reshape(-1, H, A), out.reshape(-1, H, D), strict=True)
     for start, plan, row in rows:
         torch.testing.assert_close(row, system.moments(start, plan)[0])
     assert system.calls == [((*batch, D), (*batch, A))] * H

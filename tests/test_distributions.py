@@ -156,9 +156,7 @@ class TestDiagGaussian:
             (torch.bfloat16, torch.bfloat16, torch.bfloat16),
         ],
     )
-    def test_dtypes_are_joined(
-        self, loc: torch.dtype, scale: torch.dtype, expected: torch.dtype
-    ) -> None:
+    def test_dtypes_are_joined(self, loc: torch.dtype, scale: torch.dtype, expected: torch.dtype) -> None:
         p = diag_gaussian(torch.zeros(2, 3, dtype=loc), torch.ones(3, dtype=scale))
         assert p.mean.dtype == p.variance.dtype == expected
         assert p.sample((4,)).dtype == p.rsample().dtype == expected

@@ -121,9 +121,7 @@ def missing_sections(item: Documented) -> list[str]:
 
 
 @pytest.mark.parametrize("item", EXAMPLES, ids=[item.label for item in EXAMPLES])
-def test_docstring_example(
-    item: Documented, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_docstring_example(item: Documented, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     namespace = dict(vars(importlib.import_module(item.module)))
     example = doctest.DocTestParser().get_doctest(
@@ -199,9 +197,7 @@ def test_readme_has_python_blocks() -> None:
 @pytest.mark.parametrize(
     ("line", "block"), python_blocks(), ids=[f"line{line}" for line, _ in python_blocks()]
 )
-def test_readme_block_runs(
-    line: int, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_readme_block_runs(line: int, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     exec(compile("\n" * line + block, "README.md", "exec"), {"__name__": "readme"})
 

@@ -97,14 +97,10 @@ def test_masked_rows_do_not_count(keepdim: bool, garbage: float) -> None:
     expected = Whitening(3)
     expected.update(x[mask])
     masked = Whitening(3)
-    masked.update(
-        torch.full((4, 3), garbage, dtype=torch.float64), torch.zeros(4, dtype=torch.bool)
-    )
+    masked.update(torch.full((4, 3), garbage, dtype=torch.float64), torch.zeros(4, dtype=torch.bool))
     assert masked.count == 0
     assert torch.equal(masked.transform, torch.eye(3))
-    masked.update(
-        torch.where(mask.unsqueeze(-1), x, garbage), mask.unsqueeze(-1) if keepdim else mask
-    )
+    masked.update(torch.where(mask.unsqueeze(-1), x, garbage), mask.unsqueeze(-1) if keepdim else mask)
     assert masked.count == mask.sum()
     torch.testing.assert_close(masked.state_dict(), expected.state_dict())
     masked.update(torch.full((4, 3), math.nan), torch.zeros(4, dtype=torch.bool))
@@ -266,12 +262,10 @@ def test_whitening_maps_over_stacked_buffers() -> None:
     modules = [_whitening(3) for _ in range(4)]
     x = torch.randn(4, 7, 3)
     _, buffers = torch.func.stack_module_state(modules)
-    mapped = torch.func.vmap(
-        lambda state, row: torch.func.functional_call(modules[0], state, (row,))
-    )(buffers, x)
-    torch.testing.assert_close(
-        mapped, torch.stack([m(row) for m, row in zip(modules, x, strict=True)])
+    mapped = torch.func.vmap(lambda state, row: torch.func.functional_call(modules[0], state, (row,)))(
+        buffers, x
     )
+    torch.testing.assert_close(mapped, torch.stack([m(row) for m, row in zip(modules, x, strict=True)]))
 
 
 @pytest.mark.parametrize(
@@ -484,9 +478,7 @@ def test_history_equals_torch_gru_on_each_episode(num_layers: int) -> None:
 @pytest.mark.parametrize("batch", [(7,), (4, 7), (2, 3, 7), (4, 1)])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("num_layers", [1, 2])
-def test_windows_equal_acting_step_by_step(
-    batch: tuple[int, ...], share: float, num_layers: int
-) -> None:
+def test_windows_equal_acting_step_by_step(batch: tuple[int, ...], share: float, num_layers: int) -> None:
     encoder = history_encoder(3, 2, 6, num_layers=num_layers, whitening=_whitening(3))
     window = _window(*batch, share=share)
     latent, state = _stepwise(encoder, window)
@@ -553,9 +545,7 @@ def test_a_missing_flag_falls_back_to_done_and_then_to_one_episode() -> None:
 
 
 def test_history_keys_can_be_renamed() -> None:
-    encoder = history_encoder(
-        3, 2, 6, state_key=("memory", "gru"), is_init_key=("agent", "is_init")
-    )
+    encoder = history_encoder(3, 2, 6, state_key=("memory", "gru"), is_init_key=("agent", "is_init"))
     renamed = TensorDict(
         observation=torch.randn(2, 3),
         agent={"is_init": torch.tensor([True, False])},  # without a last dimension too

@@ -70,7 +70,9 @@ class TestEveryHead:
         features, constants = _inputs(head, 5)
         p = head(features, constants)
         # A point has no density: its mean is what a squared loss trains.
-        drawn = p.log_prob(torch.randn(5, D)) if by == "log_prob" and not isinstance(p, Delta) else p.rsample()
+        drawn = (
+            p.log_prob(torch.randn(5, D)) if by == "log_prob" and not isinstance(p, Delta) else p.rsample()
+        )
         (drawn * torch.randn(drawn.shape)).sum().backward()
         assert (features.grad != 0).all()
         if constants.numel():
@@ -92,9 +94,7 @@ class TestEveryHead:
 
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     @pytest.mark.parametrize("size", [1e3, 1e6])
-    def test_extreme_features_stay_finite(
-        self, head: Head, size: float, dtype: torch.dtype
-    ) -> None:
+    def test_extreme_features_stay_finite(self, head: Head, size: float, dtype: torch.dtype) -> None:
         features, constants = _inputs(head, 64, dtype=dtype)
         with torch.no_grad():
             features.copy_(features.sign() * size)

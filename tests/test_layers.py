@@ -42,6 +42,7 @@ LAYERS = {
 SIDEWAYS = {
     ("encoders", "whitening"),
     ("baselines", "models"),
+    ("baselines", "objectives"),
     ("objectives", "models"),
     ("envs", "models"),
     ("planners", "envs"),
@@ -126,9 +127,7 @@ def violations(package: Path, layers: dict[str, int], sideways: set[tuple[str, s
             elif other not in layers:
                 found.append(f"{where} imports {other}, which has no layer")
             elif layers[other] >= layers[unit] and (unit, other) not in sideways:
-                found.append(
-                    f"{where} (layer {layers[unit]}) imports {other} (layer {layers[other]})"
-                )
+                found.append(f"{where} (layer {layers[unit]}) imports {other} (layer {layers[other]})")
     try:
         graphlib.TopologicalSorter(graph).prepare()
     except graphlib.CycleError as error:
@@ -180,9 +179,7 @@ def test_the_checker_sees(files: dict[str, str], expected: str | None, tmp_path:
         path = package / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    found = violations(
-        package, {"low": 0, "box": 0, "high": 1, "side": 1}, sideways={("high", "side")}
-    )
+    found = violations(package, {"low": 0, "box": 0, "high": 1, "side": 1}, sideways={("high", "side")})
     if expected is None:
         assert found == []
     else:
@@ -247,9 +244,7 @@ def test_library_code_neither_prints_nor_asserts() -> None:
     for name, path in module_names(PACKAGE).items():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             printing = (
-                isinstance(node, ast.Call)
-                and isinstance(node.func, ast.Name)
-                and node.func.id == "print"
+                isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
             )
             assert not printing, f"{name}:{node.lineno} prints"
             assert not isinstance(node, ast.Assert), f"{name}:{node.lineno} asserts"

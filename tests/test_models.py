@@ -20,6 +20,7 @@ from torchrl.modules import WorldModelWrapper
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.heads import DeltaHead, TargetScale
 from torchrl_vjepa.models import JEPA, VJEPA, LatentModel
+from torchrl_vjepa.noisy_tv import BatchedNoisyTVEnv, LinearGaussianSystem
 from torchrl_vjepa.predictor import Predictor
 
 O, D, A, B = 7, 3, 2, 5  # noqa: E741
@@ -32,9 +33,7 @@ class Reward(nn.Module):
         return latent.sum(-1, keepdim=True) - action.pow(2).sum(-1, keepdim=True)
 
 
-def _reward_model(
-    latent_key: NestedKey = "latent", action_key: NestedKey = "action"
-) -> TensorDictModule:
+def _reward_model(latent_key: NestedKey = "latent", action_key: NestedKey = "action") -> TensorDictModule:
     return TensorDictModule(Reward(), in_keys=[latent_key, action_key], out_keys=["reward"])
 
 
@@ -125,9 +124,7 @@ class TestForward:
         out = model(data)
         expected = encoder.module(inputs["pixels"])
         torch.testing.assert_close(out["agent", "z"], expected)
-        torch.testing.assert_close(
-            out["agent", "ahead"], predictor.dist(expected, inputs["u"]).mean
-        )
+        torch.testing.assert_close(out["agent", "ahead"], predictor.dist(expected, inputs["u"]).mean)
         assert set(out.keys(True, True)) == {*model.in_keys, *model.out_keys}
         if isinstance(model, VJEPA):
             assert model.target_scale.in_keys == [("agent", "pixels")]
@@ -222,12 +219,10 @@ class ImaginedEnv(ModelBasedEnvBase):
         out = self.world_model(tensordict.select(*self.world_model.in_keys))
         return out.select("latent", "reward", "done", "terminated", strict=False)
 
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, **keywords: object
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **keywords: object) -> TensorDictBase:
         if tensordict is None:
             return self.observation_spec.rand()
-        if "latent" in tensordict.keys():
+        if tensordict.get("latent", None) is not None:
             out = tensordict.select("latent")
         else:
             out = self.observation_spec.rand(tensordict.batch_size)
@@ -333,9 +328,7 @@ class TestWorldModel:
     def test_environment_rollout_equals_the_predictor(self, make: Callable[..., JEPA]) -> None:
         model = make()
         env = ImaginedEnv(model.as_world_model(_reward_model()))
-        policy = TensorDictSequential(
-            TensorDictModule(Feedback(), in_keys=["latent"], out_keys=["action"])
-        )
+        policy = TensorDictSequential(TensorDictModule(Feedback(), in_keys=["latent"], out_keys=["action"]))
         start = TensorDict(latent=torch.randn(B, D), batch_size=B)
         with torch.no_grad():
             data = env.rollout(
@@ -358,7 +351,23 @@ class TestWorldModel:
         assert (twin(data.clone()) == world(data.clone())).all()
 
 
-def test_a_planner_may_be_any_module_with_dist() -> None:
+@MODELS
+def test_policy_in_an_environment(make: Callable[..., JEPA]) -> None:
+    model = make()
+    system = LinearGaussianSystem(observation_dim=O, control_dim=A, seed=0)
+    env = BatchedNoisyTVEnv(4, system=system, seed=0)
+    act = TensorDictModule(Feedback(), in_keys=["latent"], out_keys=["action"])
+    policy = TensorDictSequential(model.encoder, act)
+    with torch.no_grad():
+        data = env.rollout(5, policy=policy)
+        latent = model.encoder(data.select("observation"))["latent"]
+    torch.testing.assert_close(data["latent"], latent)
+    torch.testing.assert_close(data["action"], Feedback()(latent))
+    selected = env.rollout(2, policy=policy.select_out_keys("action"))
+    assert selected.get("latent", None) is None
+
+
+def test_a_predictor_may_be_any_module_with_dist() -> None:
     """What LatentModel asks of a predictor is what its docstring says, and no more."""
 
     class Still(TensorDictModuleBase):

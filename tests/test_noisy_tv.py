@@ -149,9 +149,7 @@ def test_linear_recurrence_equals_the_loop(num_steps, radius, batch, seed):
 @pytest.mark.parametrize("same_actions", [True, False])
 def test_unroll_equals_the_equations_step_by_step(batch, same_actions):
     A = 0.7 * torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double()
-    system = small_system(
-        A=A, signal_std=0.2, distractor_decay=0.8, distractor_std=0.5, sensor_std=0.03
-    )
+    system = small_system(A=A, signal_std=0.2, distractor_decay=0.8, distractor_std=0.5, sensor_std=0.03)
     generator = torch.Generator().manual_seed(1)
     noise = torch.randn(*batch, 11, 12, generator=generator, dtype=torch.float64)
     shape = (11, 1) if same_actions else (*batch, 11, 1)
@@ -192,9 +190,7 @@ def test_initial_state_overrides_only_the_first_row():
     assert torch.equal(data["signal"][:, 0], s0.expand(2, 3))
     assert torch.equal(data["distractor"][:, 0], d0)
     torch.testing.assert_close(data["distractor"][:, 4], 0.9**4 * d0)
-    torch.testing.assert_close(
-        data["signal"][:, 2], (system.A @ system.A @ s0.double()).float().expand(2, 3)
-    )
+    torch.testing.assert_close(data["signal"][:, 2], (system.A @ system.A @ s0.double()).float().expand(2, 3))
 
 
 def test_moments_agree_with_the_closed_forms():
@@ -220,9 +216,7 @@ def test_moments_agree_with_the_closed_forms():
             assert error.max() < 6 * math.sqrt(2 / num)
             assert (value.mean(0).abs() / scale).max() < 6 / math.sqrt(num)
     residual = (
-        data["observation"]
-        - data["signal"] @ system.C.T
-        - noise_scale * data["distractor"] @ system.D.T
+        data["observation"] - data["signal"] @ system.C.T - noise_scale * data["distractor"] @ system.D.T
     )
     # Two times apart are independent; each has the sensor's standard deviation.
     assert abs(residual.std() / 0.01 - 1) < 1e-2
@@ -336,9 +330,7 @@ def test_episode_truncates_at_200_steps_and_no_further():
 
 def test_make_passes_arguments_on():
     system = LinearGaussianSystem(control_dim=3, seed=9)
-    env = gymnasium.make(
-        ENV_ID, system=system, noise_scale=2.0, episode_length=3, action_bound=0.5
-    ).unwrapped
+    env = gymnasium.make(ENV_ID, system=system, noise_scale=2.0, episode_length=3, action_bound=0.5).unwrapped
     assert env.action_space == gymnasium.spaces.Box(-0.5, 0.5, (3,), np.float32)
     assert torch.equal(env.system.A, system.A)
     assert env.noise_scale == 2.0
@@ -585,9 +577,7 @@ def test_batched_step_refuses_and_keeps_its_state():
     "device",
     [
         "cpu",
-        pytest.param(
-            "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-        ),
+        pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")),
     ],
 )
 def test_moving_takes_the_running_episodes_along(device):
@@ -626,9 +616,7 @@ def test_runs_in_a_collector_and_in_a_serial_env():
     serial = SerialEnv(2, make_single_env)
     assert serial.rollout(3)["observation"].shape == (2, 1, 3, 20)
     serial.close()
-    assert (
-        pickle.loads(pickle.dumps(make_single_env())).reset() == make_single_env().reset()
-    ).all()
+    assert (pickle.loads(pickle.dumps(make_single_env())).reset() == make_single_env().reset()).all()
 
 
 # ---------------------------------------------------------------- Kalman filter
@@ -820,9 +808,7 @@ def test_value_function_solves_bellmans_equation():
 def test_expected_cost_is_the_simulated_average(noise_scale):
     """Blurred sensors, so that the estimation error is a visible part of the cost."""
     system = LinearGaussianSystem(control_dim=2, seed=2, sensor_std=0.5)
-    env = BatchedNoisyTVEnv(
-        2000, noise_scale, system=system, action_bound=1e3, episode_length=60, seed=0
-    )
+    env = BatchedNoisyTVEnv(2000, noise_scale, system=system, action_bound=1e3, episode_length=60, seed=0)
     controller = LQGController(system, noise_scale, action_bound=math.inf)
     env = TransformedEnv(env, get_env_transforms_from_module(controller))
     cost = -env.rollout(60, controller)["next", "reward"].mean(1)
@@ -889,9 +875,7 @@ def test_controller_is_the_filter_and_the_regulator_step_by_step():
         belief = controller.kalman.filter(episode["observation"], episode["action"])
         solution = controller.solution
         action = solution.feedforward - belief["signal_mean"] @ solution.gain.T
-        torch.testing.assert_close(
-            episode["action"], action.clamp(-2, 2).float(), atol=1e-4, rtol=1e-4
-        )
+        torch.testing.assert_close(episode["action"], action.clamp(-2, 2).float(), atol=1e-4, rtol=1e-4)
 
 
 def test_controller_restarts_only_the_rows_that_are_reset():

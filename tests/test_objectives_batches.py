@@ -10,10 +10,22 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
-from torchrl_vjepa import JEPA, VJEPA, DeltaHead, JEPALoss, Predictor, TargetScale, VJEPALoss, linear_encoder
+from torchrl_vjepa import (
+    JEPA,
+    VJEPA,
+    DeltaHead,
+    JEPALoss,
+    Predictor,
+    TargetScale,
+    VJEPALoss,
+    Whitening,
+    linear_encoder,
+)
 
 OBS, LATENT, ACTION = 6, 3, 2
 SKIPS = (1, 3)
@@ -28,14 +40,20 @@ def make_windows(*batch: int) -> TensorDict:
     )
 
 
-def make_model(cls: type[JEPA] = VJEPA, *, std: float | None = None, skips: tuple[int, ...] = SKIPS) -> Any:
+def make_model(
+    cls: type[JEPA] = VJEPA,
+    *,
+    std: float | None = None,
+    skips: tuple[int, ...] = SKIPS,
+    whitening: Whitening | None = None,
+) -> Any:
     kwargs = {}
     if cls is VJEPA:
         kind = "learned" if std is None else "constant"
         scale = TargetScale(LATENT, kind=kind, init_std=std or 0.6, log_var_range=(-80.0, 16.0))
         kwargs["target_scale"] = scale
     predictor = Predictor(LATENT, ACTION, head=DeltaHead() if cls is JEPA else None, skips=skips)
-    return cls(linear_encoder(OBS, LATENT), predictor, **kwargs).double()
+    return cls(linear_encoder(OBS, LATENT, whitening=whitening), predictor, **kwargs).double()
 
 
 def jepa(model: Any = None, **kwargs: Any) -> Any:
@@ -220,11 +238,17 @@ def trained(loss: Any, batches: list[TensorDict]) -> list[TensorDict]:
     return history
 
 
-@pytest.mark.parametrize("stacked", [False, True])
+@pytest.mark.parametrize(("stacked", "whitened"), [(False, False), (True, False), (False, True)])
 @BUILDERS
-def test_a_list_trains_like_each_model_alone(build: Callable[..., Any], stacked: bool) -> None:
+def test_a_list_trains_like_each_model_alone(
+    build: Callable[..., Any], stacked: bool, whitened: bool
+) -> None:
     """Values, gradients and five steps of Adam and EMA; the targets are sampled."""
-    models = [make_model(JEPA if build is jepa else VJEPA) for _ in range(3)]
+    whitening = Whitening(OBS) if whitened else None
+    if whitening is not None:
+        whitening.update(torch.randn(100, OBS) * torch.linspace(0.5, 2, OBS) + 1)
+    cls = JEPA if build is jepa else VJEPA
+    models = [make_model(cls, whitening=copy.deepcopy(whitening)) for _ in range(3)]
     batches = [make_windows(3, 4, 7) if stacked else make_windows(4, 7) for _ in range(5)]
     for batch in batches:
         batch["is_init"] = torch.rand(*batch.shape, 1) < 0.1
@@ -308,14 +332,14 @@ BAD_WINDOWS = {
     ),
     "NaN": (lambda: with_value("observation", math.nan), ValueError, "'observation' must be finite.*got 1 "),
     "infinite": (lambda: with_value("action", math.inf), ValueError, "'action' must be finite.*mark them"),
-    "short": (lambda: make_windows(4, 3), ValueError, "longer than the largest skip 3, got T=3; sample longer"),
+    "short": (lambda: make_windows(4, 3), ValueError, "longer than the largest skip 3, got T=3; sample"),
     "one step": (lambda: make_windows(), ValueError, "must be windows of shape"),
     "observation size": (
         lambda: spoilt(observation=torch.randn(4, 6, OBS + 1).double()),
         ValueError,
         r"'observation' must have shape .*6\), got \(4, 6, 7\)",
     ),
-    "action size": (lambda: spoilt(action=torch.randn(4, 6, 3).double()), ValueError, "action must have shape"),
+    "action size": (lambda: spoilt(action=torch.randn(4, 6, 3).double()), ValueError, "action must have"),
     "other dtype": (lambda: make_windows(4, 6).float(), TypeError, "dtype of the encoder's weights"),
     "mask shape": (
         lambda: spoilt(shifted_valid=torch.ones(4, 6, 2, dtype=torch.bool)),
@@ -343,7 +367,8 @@ def test_bad_windows_are_refused(build: Callable[..., Any], case: str) -> None:
     assert set(windows.keys(True, True)) == set(before.keys(True, True))
     for key, value in windows.items(True, True):
         torch.testing.assert_close(value, before[key], equal_nan=True)
-    assert all(torch.equal(value, state[key]) for key, value in loss.state_dict().items() if torch.is_tensor(value))
+    after = loss.state_dict()
+    assert all(torch.equal(value, after[key]) for key, value in state.items() if torch.is_tensor(value))
 
 
 def test_the_other_entry_may_have_any_size_alike() -> None:
@@ -355,12 +380,61 @@ def test_the_other_entry_may_have_any_size_alike() -> None:
     torch.testing.assert_close(dict(zip(loss.out_keys, by_keyword, strict=True)), loss(windows).to_dict())
 
 
+@BUILDERS
+def test_keyword_call_without_actions(build: Callable[..., Any]) -> None:
+    """A single entry, from which dispatch cannot tell the batch size at all."""
+    model = VJEPA(linear_encoder(OBS, LATENT), Predictor(LATENT, skips=(1, 2))).double()
+    loss = build(model)
+    windows = make_windows(4, 6).select("observation")
+    torch.manual_seed(1)
+    expected = loss(windows)
+    torch.manual_seed(1)
+    results = loss(observation=windows["observation"])
+    torch.testing.assert_close(dict(zip(loss.out_keys, results, strict=True)), expected.to_dict())
+
+
+@pytest.mark.parametrize("cls", [JEPALoss, VJEPALoss])
+def test_a_regulariser_can_be_switched_on_later(cls: type[Any]) -> None:
+    """Coefficients of zero at the start, raised by a schedule."""
+    loss = cls(make_model())
+    SoftUpdate(loss, eps=0.99)
+    windows = make_windows(4, 7)
+    loss(windows)
+    loss.marginal_entropy_coeff = 0.1
+    assert loss(windows)["loss_entropy"] > 0
+    assert "loss_entropy" in loss.out_keys
+
+
+@pytest.mark.parametrize("cls", [JEPA, VJEPA])
+def test_images(cls: type[JEPA]) -> None:
+    """Observations of any shape, with padding, equal the same numbers as vectors."""
+    network = nn.Linear(OBS, LATENT)
+    encoders = [
+        TensorDictModule(nn.Sequential(flatten, network), ["observation"], ["latent"])
+        for flatten in (nn.Flatten(-3), nn.Identity())
+    ]
+    windows = make_windows(4, 7).float()
+    windows["collector", "mask"] = torch.rand(4, 7, 1) < 0.8
+    images = windows.clone()
+    images["observation"] = images["observation"].reshape(4, 7, 1, 2, OBS // 2)
+    predictor = Predictor(LATENT, ACTION, skips=SKIPS)
+    results = []
+    for encoder, data in zip(encoders, (images, windows), strict=True):
+        loss = (JEPALoss if cls is JEPA else VJEPALoss)(cls(encoder, predictor))
+        SoftUpdate(loss, eps=0.99)
+        torch.manual_seed(1)
+        results.append(loss(data))
+    torch.testing.assert_close(results[0].to_dict(), results[1].to_dict())
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: VJEPALoss([]), "non-empty list"),
-        (lambda: JEPALoss([make_model(), "model"]), "must be a JEPA or VJEPA"),
-        (lambda: VJEPALoss(make_model(JEPA)), "model must be a VJEPA or a list of them; for a JEPA use JEPALoss"),
+        (lambda: VJEPALoss(None), "must be a VJEPA .* got .*NoneType"),
+        (lambda: VJEPALoss(make_model(), skip_weights=(1.0, -1.0)), "skip_weights must be one finite weight"),
+        (lambda: JEPALoss([make_model(), "model"]), "must be a JEPA or a non-empty list"),
+        (lambda: VJEPALoss(make_model(JEPA)), r"model must be a VJEPA .* got \['JEPA'\]"),
         (lambda: VJEPALoss([make_model(), make_model(JEPA)]), "must be a VJEPA"),
         (lambda: JEPALoss(make_model(JEPA), stacked_data=True), "stacked_data=True needs a list of models"),
         (lambda: JEPALoss(make_model(JEPA), reduction="max"), "reduction must be .* got 'max'"),
@@ -379,14 +453,14 @@ def test_bad_arguments_are_refused(make: Callable[[], Any], message: str) -> Non
 
 
 def test_models_of_different_sizes_are_refused() -> None:
-    with pytest.raises(ValueError, match="model"):
+    with pytest.raises(ValueError, match="one architecture, but the parameters of model 1"):
         VJEPALoss([make_model(), make_model(skips=(1, 2))])
 
 
 def test_the_same_model_twice_is_refused() -> None:
     """get_model(0) and get_model(1) would write into the same object."""
     model = make_model()
-    with pytest.raises(ValueError, match="model"):
+    with pytest.raises(ValueError, match="distinct models"):
         VJEPALoss([model, model])
 
 

@@ -53,9 +53,7 @@ class TestLinearTrunk:
         for index, skip in enumerate(SKIPS):
             p = predictor.dist(latent, skip=skip)
             torch.testing.assert_close(p.mean, latent @ predictor.trunks[index].weight.mT)
-            torch.testing.assert_close(
-                p.variance.log(), torch.full((B, D), float(index)), atol=1e-3, rtol=0
-            )
+            torch.testing.assert_close(p.variance.log(), torch.full((B, D), float(index)), atol=1e-3, rtol=0)
 
     def test_has_no_bias_unless_asked(self) -> None:
         assert Predictor(D, A).trunks[0].bias is None
@@ -169,11 +167,9 @@ class TestDist:
         predictor = Predictor(D, A, trunk=trunk, head=DiagGaussianHead("constant"))
         latent, action = _latent(), torch.randn(B, A)
         with torch.autocast("cpu", torch.bfloat16):
-            p = predictor.dist(latent.bfloat16(), action)
+            p = predictor.dist(latent.bfloat16(), action.bfloat16())
             assert p.rsample().isfinite().all()
-        torch.testing.assert_close(
-            p.mean.float(), predictor.dist(latent, action).mean, atol=0.05, rtol=0.05
-        )
+        torch.testing.assert_close(p.mean.float(), predictor.dist(latent, action).mean, atol=0.05, rtol=0.05)
 
     @TRUNKS
     def test_compiles_without_a_graph_break(self, trunk: str) -> None:

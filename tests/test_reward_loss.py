@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.modules import set_recurrent_mode
 
 from torchrl_vjepa import (
     VJEPA,
@@ -138,7 +137,8 @@ def test_reductions(num_steps: int) -> None:
     }
     rows = results["none"]["loss_reward"]
     assert list(results["none"].keys()) == ["loss_reward"]
-    assert rows.shape == (4, 7 - num_steps)
+    assert rows.shape == (4, 6)
+    assert (rows[:, 7 - num_steps :] == 0).all()
     torch.testing.assert_close(rows.sum(), results["sum"]["loss_reward"])
     torch.testing.assert_close(rows.sum() / (rows != 0).sum(), results["mean"]["loss_reward"])
     torch.testing.assert_close(results["sum"]["reward_error"], results["mean"]["reward_error"])
@@ -187,7 +187,11 @@ def test_fits_a_quadratic_reward_exactly() -> None:
     windows["next", "reward"] = -cost.unsqueeze(-1)
     loss = RewardLoss(model, head)
     optimizer = torch.optim.LBFGS(
-        loss.parameters(), max_iter=200, line_search_fn="strong_wolfe", tolerance_grad=1e-14, tolerance_change=0
+        loss.parameters(),
+        max_iter=200,
+        line_search_fn="strong_wolfe",
+        tolerance_grad=1e-14,
+        tolerance_change=0,
     )
 
     def closure() -> Tensor:
@@ -211,8 +215,7 @@ def test_history_encoder() -> None:
     head, windows = make_head(), make_windows(3, 6)
     windows["is_init"] = torch.zeros(3, 6, 1, dtype=torch.bool)
     windows["is_init"][:, 0] = windows["is_init"][1, 3] = True
-    with set_recurrent_mode(True):
-        value = RewardLoss(model, head)(windows)["loss_reward"]
+    value = RewardLoss(model, head)(windows)["loss_reward"]
     errors, state = [], torch.zeros(3, 1, 5, dtype=torch.float64)
     for t in range(6):
         step = windows[:, t].clone()
@@ -227,7 +230,9 @@ def test_history_encoder() -> None:
 # --- bad input
 
 
-def refused(message: str, error: type[Exception] = ValueError, *, num_steps: int = 1, **entries: Tensor) -> None:
+def refused(
+    message: str, error: type[Exception] = ValueError, *, num_steps: int = 1, **entries: Tensor
+) -> None:
     windows = make_windows(4, 6)
     for key, value in entries.items():
         windows[("next", key) if key in ("reward", "done") else key] = value
@@ -244,8 +249,8 @@ def test_bad_windows_are_refused() -> None:
         value[1, 2] = math.nan
         name = key if isinstance(key, str) else key[-1]
         refused(f"{name}.* must be finite", **{name: value})
-    refused("at least num_steps=7 steps", num_steps=7)
-    refused("observation", TypeError, observation=torch.zeros(4, 6, OBS, dtype=torch.uint8))
+    refused("longer than the largest skip 6, got T=6", num_steps=7)
+    refused("must be floating point", observation=torch.zeros(4, 6, OBS, dtype=torch.uint8))
     refused("'observation' must have shape", observation=torch.zeros(4, 6, OBS + 1).double())
     refused("action must have shape", action=torch.zeros(4, 6, ACTION + 1).double())
     refused("mask 'shifted_valid' must have shape", shifted_valid=torch.ones(4, 6, 3, dtype=torch.bool))
@@ -288,6 +293,20 @@ def test_flags_of_the_wrong_shape_are_refused() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RewardLoss(make_model(), make_head(), **arguments)
+
+
+def test_padded_images() -> None:
+    encoder = TensorDictModule(
+        nn.Sequential(nn.Flatten(-3), nn.Linear(OBS, LATENT)), in_keys=["observation"], out_keys=["latent"]
+    )
+    model = VJEPA(encoder, Predictor(LATENT, ACTION)).double()
+    windows = make_windows(4, 6)
+    windows["observation"] = windows["observation"].reshape(4, 6, 1, 2, OBS // 2)
+    windows["collector", "mask"] = torch.ones(4, 6, 1, dtype=torch.bool)
+    loss = RewardLoss(model, make_head())
+    torch.testing.assert_close(
+        loss(windows)["loss_reward"], loss(windows.exclude(("collector", "mask")))["loss_reward"]
+    )
 
 
 def test_a_model_without_actions() -> None:

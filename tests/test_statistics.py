@@ -220,9 +220,7 @@ def test_effective_rank_of_constant_latents_is_zero(value: float) -> None:
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_values_that_are_not_finite_come_out_as_nan(
-    function: Callable[..., Tensor], bad: float
-) -> None:
+def test_values_that_are_not_finite_come_out_as_nan(function: Callable[..., Tensor], bad: float) -> None:
     x = torch.randn(9, 4)  # from dimension 3 on, eigvalsh itself raises
     x[2, 1] = bad
     assert function(x).isnan().any()
@@ -237,9 +235,7 @@ def test_vmap_equals_a_loop(function: Callable[..., Tensor]) -> None:
     mask = torch.rand(3, 8, 5) < 0.7
     x[~mask] = math.nan
     mapped = torch.func.vmap(function)(x, mask)
-    torch.testing.assert_close(
-        mapped, torch.stack([function(*a) for a in zip(x, mask, strict=True)])
-    )
+    torch.testing.assert_close(mapped, torch.stack([function(*a) for a in zip(x, mask, strict=True)]))
     x = x.nan_to_num()
     mapped = torch.func.vmap(function)(x)
     torch.testing.assert_close(mapped, torch.stack([function(a) for a in x]))
@@ -252,9 +248,7 @@ def test_vmap_of_the_gradient_equals_a_loop() -> None:
     mask = torch.rand(3, 12) < 0.7
     gradient = torch.func.grad(gaussian_entropy)
     mapped = torch.func.vmap(gradient)(x, mask)
-    torch.testing.assert_close(
-        mapped, torch.stack([gradient(*a) for a in zip(x, mask, strict=True)])
-    )
+    torch.testing.assert_close(mapped, torch.stack([gradient(*a) for a in zip(x, mask, strict=True)]))
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)

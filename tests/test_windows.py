@@ -101,9 +101,7 @@ class TestStepMask:
     @pytest.mark.parametrize("shape", [(2,), (2, 4, 2), (2, 3), (2, 4, 1, 1)])
     def test_other_shapes_are_refused(self, shape: tuple[int, ...]) -> None:
         data = TensorDict(mask=torch.ones(shape), batch_size=2)
-        with pytest.raises(
-            ValueError, match=r"mask 'mask' must have shape \(2, 4\) or \(2, 4, 1\), got"
-        ):
+        with pytest.raises(ValueError, match=r"mask 'mask' must have shape \(2, 4\) or \(2, 4, 1\), got"):
             step_mask(data, ["mask"], torch.Size((2, 4)))
 
 

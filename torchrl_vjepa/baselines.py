@@ -270,6 +270,7 @@ class VAELoss(WindowLoss):
     target_decoder_params: TensorDictParams
 
     _schedulable_buffers = frozenset({"kl_coeff"})
+    _model_type = VAE
 
     def __init__(
         self,
@@ -341,6 +342,8 @@ class PixelARLoss(WindowLoss):
     decoder: PixelDecoder
     decoder_params: TensorDictParams
     target_decoder_params: TensorDictParams
+
+    _model_type = PixelAR
 
     def __init__(
         self,

@@ -20,7 +20,64 @@ from torchrl_vjepa.windows import read
 __all__ = ["FusedPredictor", "Predictor"]
 
 
-class Predictor(TensorDictModuleBase):
+class _Transition(TensorDictModuleBase):
+    """``dist`` as a TensorDictModule: what a predictor and its fusion with a prior share."""
+
+    latent_dim: int
+    action_dim: int
+    side_info_dim: int
+    skips: tuple[int, ...]
+    how: Literal["mean", "mode", "sample"]
+    latent_key: NestedKey
+    action_key: NestedKey
+    side_info_key: NestedKey
+
+    def dist(
+        self,
+        latent: Tensor,
+        action: Tensor | None = None,
+        *,
+        skip: int = 1,
+        side_info: Tensor | None = None,
+    ) -> Distribution:
+        raise NotImplementedError
+
+    def dist_of(self, tensordict: TensorDictBase) -> Distribution:
+        """The one-step predictive distribution of what ``in_keys`` names.
+
+        Args:
+            tensordict: holds ``latent`` and what else ``in_keys`` names.
+
+        Returns:
+            Distribution with batch ``*B`` and event ``(D,)``.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        latent, *rest = (read(tensordict, key, reader=type(self).__name__) for key in self.in_keys)
+        return self.dist(
+            latent,
+            rest.pop(0) if self.action_dim else None,
+            side_info=rest.pop(0) if self.side_info_dim else None,
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the one-step point prediction.
+
+        Args:
+            tensordict: holds ``latent`` and what else ``in_keys`` names.
+
+        Returns:
+            The same tensordict with the entry ``out_keys[0]``.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        p = self.dist_of(tensordict)
+        return tensordict.set(self.out_keys[0], point_estimate(p, self.how))
+
+
+class Predictor(_Transition):
     r"""Predictive model :math:`p_\phi(Z_{t+\Delta} \mid Z_t, \xi_{t+\Delta}, u_{t:t+\Delta-1})`.
 
     The controlled latent transition of ``eq:vjepa_controlled_dynamics``. :math:`\Delta` is one of
@@ -199,25 +256,6 @@ class Predictor(TensorDictModuleBase):
             )
         return self.head(features, self.constants[index])
 
-    def dist_of(self, tensordict: TensorDictBase) -> Distribution:
-        """The one-step predictive distribution of what ``in_keys`` names.
-
-        Args:
-            tensordict: holds ``latent`` and what else ``in_keys`` names.
-
-        Returns:
-            Distribution with batch ``*B`` and event ``(D,)``.
-
-        Raises:
-            KeyError: if an entry is missing.
-        """
-        latent, *rest = (read(tensordict, key, reader=type(self).__name__) for key in self.in_keys)
-        return self.dist(
-            latent,
-            rest.pop(0) if self.action_dim else None,
-            side_info=rest.pop(0) if self.side_info_dim else None,
-        )
-
     def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
         batch = latent.shape[:-1]
         shapes = [(*batch, skip, self.action_dim)]
@@ -239,23 +277,8 @@ class Predictor(TensorDictModuleBase):
             )
         return side_info
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the one-step point prediction.
 
-        Args:
-            tensordict: holds ``latent`` and what else ``in_keys`` names.
-
-        Returns:
-            The same tensordict with the entry ``out_keys[0]``.
-
-        Raises:
-            KeyError: if an entry is missing.
-        """
-        p = self.dist_of(tensordict)
-        return tensordict.set(self.out_keys[0], point_estimate(p, self.how))
-
-
-class FusedPredictor(TensorDictModuleBase):
+class FusedPredictor(_Transition):
     r"""Hard fusion of the dynamics with a prior by product of experts (``eq:bjepa_posterior``).
 
     :math:`p(Z_T \mid Z_C, \eta) \propto p_{\text{like}}(Z_T \mid Z_C)\, p_{\text{prior}}(Z_T \mid \eta)`,
@@ -306,22 +329,3 @@ class FusedPredictor(TensorDictModuleBase):
         """
         p = self.predictor.dist(latent, action, skip=skip, side_info=side_info)
         return p if self.prior is None else product_of_experts(p, self.prior())
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the one-step point prediction.
-
-        Args:
-            tensordict: holds ``latent`` and what else ``in_keys`` names.
-
-        Returns:
-            The same tensordict with the entry ``out_keys[0]``.
-        """
-        return tensordict.set(self.out_keys[0], point_estimate(_one_step(self, tensordict), self.how))
-
-
-def _one_step(predictor: Predictor | FusedPredictor, tensordict: TensorDictBase) -> Distribution:
-    return predictor.dist(
-        tensordict.get(predictor.latent_key),
-        tensordict.get(predictor.action_key) if predictor.action_dim else None,
-        side_info=tensordict.get(predictor.side_info_key) if predictor.side_info_dim else None,
-    )

@@ -78,6 +78,7 @@ class LatentPredictionLoss(WindowLoss):
     target_predictor_params: TensorDictParams
 
     _schedulable_buffers = frozenset({"variance_coeff", "covariance_coeff", "marginal_entropy_coeff"})
+    _model_type = JEPA
     #: The effective rank is compared with ``collapse_rank`` in every so many calls: it makes a GPU wait.
     collapse_interval: int = 20
 
@@ -94,9 +95,7 @@ class LatentPredictionLoss(WindowLoss):
         collapse_rank: float = 1.2,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
-        models = [model] if isinstance(model, JEPA) else list(model)
-        if not models or not all(isinstance(m, JEPA) for m in models):
-            raise ValueError("model must be a JEPA or VJEPA, or a non-empty list of them")
+        models = self._checked(model)
         super().__init__(
             model,
             {"encoder": "encoder", "predictor": "predictor", **(modules or {})},
@@ -150,8 +149,7 @@ class LatentPredictionLoss(WindowLoss):
         return (self._target_params(), *super()._params())
 
     def _target_params(self) -> TensorDictBase:
-        if not self._shared_keys:
-            return self.target_encoder_params
+        # A copy of the structure, because to_module() would register the targets as parameters in it.
         target = TensorDict(
             dict(self.target_encoder_params.items()), self.target_encoder_params.batch_size
         ).clone(recurse=False)

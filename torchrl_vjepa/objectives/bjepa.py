@@ -55,13 +55,11 @@ class BJEPALoss(VJEPALoss):
     target_prior_params: TensorDictParams
 
     _schedulable_buffers = frozenset({"structural_kl_coeff"})
+    _model_type = BJEPA
 
     def __init__(
         self, model: BJEPA | Sequence[BJEPA], *, structural_kl_coeff: float = 0.1, **kwargs: Any
     ) -> None:
-        models = [model] if isinstance(model, BJEPA) else list(model)
-        if not all(isinstance(m, BJEPA) for m in models):
-            raise ValueError("model must be a BJEPA or a list of them; for a VJEPA use VJEPALoss")
         super().__init__(model, modules={"prior": "structural_prior_module"}, **kwargs)
         self._register_coeff("structural_kl_coeff", structural_kl_coeff)
 

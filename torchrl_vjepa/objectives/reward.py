@@ -84,6 +84,8 @@ class RewardLoss(WindowLoss):
     predictor_params: TensorDictParams
     target_predictor_params: TensorDictParams
 
+    _model_type = SimpleNamespace  # what the constructor makes of the model and the head
+
     def __init__(
         self,
         model: LatentModel,
@@ -115,8 +117,10 @@ class RewardLoss(WindowLoss):
         if "encoder" not in self.__dict__:  # while the parent is being built
             return []
         predictor = self.predictor
-        action = [predictor.action_key] if predictor.action_dim else []
-        return [self.encoder.in_keys[0], *action, self.tensor_keys.reward]
+        observation_key, reward_key = self.encoder.in_keys[0], self.tensor_keys.reward
+        if predictor.action_dim:
+            return [observation_key, reward_key, predictor.action_key]
+        return [reward_key, observation_key]
 
     def _optional_keys(self) -> list[NestedKey]:
         return super()._optional_keys() if "encoder" in self.__dict__ else []
@@ -142,7 +146,12 @@ class RewardLoss(WindowLoss):
         self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
     ) -> dict[str, Tensor]:
         steps, length = self.num_steps, data.shape[1]
-        reward = data.get(self.tensor_keys.reward).unfold(1, steps, 1).transpose(-1, -2)
+        true = data.get(self.tensor_keys.reward)
+        if true.ndim != 3 or true.shape[-1] != 1:
+            raise ValueError(
+                f"{self.tensor_keys.reward!r} must have shape {(*data.shape, 1)}, got {tuple(true.shape)}"
+            )
+        reward = true.unfold(1, steps, 1).transpose(-1, -2)
         chunks = None
         if self.predictor.action_dim:
             action = data.get(self.predictor.action_key)

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
 from torchrl_vjepa.distributions import diag_gaussian
-from torchrl_vjepa.models import JEPA, VJEPA
+from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
 from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.statistics import covariance_entropy, masked_moments
@@ -91,6 +91,7 @@ class VJEPALoss(LatentPredictionLoss):
     target_scale_params: TensorDictParams
 
     _schedulable_buffers = frozenset({"target_kl_coeff"})
+    _model_type = VJEPA
 
     def __init__(
         self,
@@ -114,9 +115,6 @@ class VJEPALoss(LatentPredictionLoss):
             )
         if residual_variance not in ("head", "batch"):
             raise ValueError(f"residual_variance must be 'head' or 'batch', got {residual_variance!r}")
-        models: list[JEPA] = [model] if isinstance(model, JEPA) else list(model)
-        if not all(isinstance(m, VJEPA) for m in models):
-            raise ValueError("model must be a VJEPA or a list of them; for a JEPA use JEPALoss")
         super().__init__(
             model,
             # Not named target_scale: SoftUpdate would take it for the target of "scale".
@@ -146,7 +144,8 @@ class VJEPALoss(LatentPredictionLoss):
 
     def _target_std(self, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
         with params["scale"].to_module(self.scale):
-            std = self.scale.module(data.get(self.scale.in_keys[0]))
+            # Whatever an observation is, the scale reads it as one vector.
+            std = self.scale.module(data.get(self.scale.in_keys[0]).flatten(2))
         std = std.float() if std.dtype in (torch.float16, torch.bfloat16) else std
         return std.detach() if self.target_scale_gradient == "none" else std
 

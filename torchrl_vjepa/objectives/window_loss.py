@@ -68,6 +68,7 @@ class WindowLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     _vmap_randomness = "same"
+    _model_type: type = torch.nn.Module
 
     def __init__(
         self,
@@ -84,9 +85,7 @@ class WindowLoss(LossModule):
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction must be 'mean', 'sum' or 'none', got {reduction!r}")
         several = isinstance(model, Sequence)
-        models = list(model) if several else [model]
-        if not models:
-            raise ValueError("model must be a model or a non-empty list of models, got an empty list")
+        models = self._checked(model)
         if stacked_data and not several:
             raise ValueError("stacked_data=True needs a list of models, got a single model")
         self.num_models = len(models) if several else None
@@ -106,6 +105,28 @@ class WindowLoss(LossModule):
             )
         self._set_in_keys()
         self._out_keys: list[NestedKey] | None = None
+
+    @classmethod
+    def _checked(cls, model: Any) -> list[Any]:
+        """The models as a list: of the right type, distinct, and of the same architecture."""
+        models = list(model) if isinstance(model, Sequence) else [model]
+        if not models or not all(isinstance(m, cls._model_type) for m in models):
+            raise ValueError(
+                f"model must be a {cls._model_type.__name__} or a non-empty list of them for {cls.__name__}, "
+                f"got {[type(m).__name__ for m in models]}"
+            )
+        if len({id(m) for m in models}) != len(models):
+            raise ValueError("model must be a list of distinct models, got the same one twice; build each")
+        shapes = [
+            {key: value.shape for key, value in m.state_dict().items()} for m in models if len(models) > 1
+        ]
+        for i, other in enumerate(shapes):
+            if other != shapes[0]:
+                raise ValueError(
+                    f"model must be a list of models of one architecture, but the parameters of model {i} "
+                    "differ in name or shape from those of model 0"
+                )
+        return models
 
     def _register_coeff(self, name: str, value: float) -> None:
         if not (math.isfinite(value) and value >= 0):
@@ -145,7 +166,7 @@ class WindowLoss(LossModule):
     # What a member adds
 
     def _required_keys(self) -> list[NestedKey]:
-        """Floating-point entries that ``forward`` needs: the observation first."""
+        """Floating-point entries that ``forward`` needs; the last tells the shape of the batch."""
         return [self.encoder.in_keys[0]]
 
     def _optional_keys(self) -> list[NestedKey]:
@@ -184,16 +205,18 @@ class WindowLoss(LossModule):
             ValueError: if ``index`` is missing for a list, given for a single model, or out of range.
         """
         models: list[Any] = self.__dict__["_models"]
-        if self.num_models is None:
-            if index is not None:
-                raise ValueError(f"index must be None for a single model, got {index}")
-            return models[0]
-        if index is None or not 0 <= index < self.num_models:
+        if self.num_models is None and index is not None:
+            raise ValueError(f"index must be None for a single model, got {index}")
+        if self.num_models is not None and (index is None or not 0 <= index < self.num_models):
             raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
+        model = models[index or 0]
         for name, attribute in self._modules_of_model.items():
-            stacked = getattr(self, f"{name}_params").data[index]
-            TensorDict.from_module(getattr(models[index], attribute)).data.update_(stacked)
-        return models[index]
+            params = getattr(self, f"{name}_params").data
+            # Of a single model these are its own, unless the loss was copied or unpickled.
+            TensorDict.from_module(getattr(model, attribute)).data.update_(
+                params if index is None else params[index]
+            )
+        return model
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -222,6 +245,11 @@ class WindowLoss(LossModule):
                 randomness=self._vmap_randomness,
             )(data, masks, *params)
         terms = {key: terms[key] for key in self.out_keys}
+        if self.reduction == "none":
+            lead = () if self.num_models is None else (self.num_models,)
+            batch = self._batch_shape(tensordict)
+            batch = batch[1:] if self.stacked_data else batch
+            terms = {key: value.reshape(*lead, *batch) for key, value in terms.items()}
         self._watch(terms)
         out = TensorDict(terms, batch_size=[])
         self._clear_weakrefs(tensordict, out, *[f"{name}_params" for name in self._modules_of_model])
@@ -230,15 +258,19 @@ class WindowLoss(LossModule):
     def _watch(self, terms: dict[str, Tensor]) -> None:
         """Called with the terms of all models."""
 
+    def _batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
+        """``(*B, T)``, read off the data: dispatch() guesses it wrongly where sizes agree by chance."""
+        name = type(self).__name__
+        *_, anchor = [read(tensordict, key, reader=name) for key in self._required_keys()]
+        images = self._required_keys()[-1] == self.encoder.in_keys[0]
+        event_dims = max(1, anchor.ndim - tensordict.ndim) if images else 1
+        return anchor.shape[:-event_dims]
+
     def _read(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, dict[str, Tensor]]:
         """Checked windows ``(B, T)`` and the masks of steps (``"steps"``) and pairs (``"<skip>"``)."""
-        name = type(self).__name__
         required = self._required_keys()
-        entries = {key: read(tensordict, key, reader=name) for key in required}
-        observation = entries[required[0]]
-        # dispatch() guesses the batch size wrongly where sizes agree by chance: read it off the data.
-        event_dims = 1 if len(required) > 1 else observation.ndim - tensordict.ndim
-        batch = entries[required[-1]].shape[: -event_dims or None]
+        batch = self._batch_shape(tensordict)
+        entries = {key: tensordict.get(key) for key in required}
         if not batch:
             raise ValueError(
                 f"the input must be windows of shape (*B, T), got a batch of shape {tuple(batch)}"
@@ -264,8 +296,8 @@ class WindowLoss(LossModule):
         longest = max(self.skips, default=0)
         if batch[-1] <= longest:
             raise ValueError(
-                f"the windows must be longer than the largest skip {longest}, got T={batch[-1]}; "
-                "sample longer slices (slice_len) or drop that skip"
+                f"the windows must be longer than the largest skip {longest}, got T={batch[-1]}; sample "
+                "longer slices (slice_len)"
             )
         # What an encoder with memory may read besides: state and beginnings of episodes.
         for key in (*self.encoder.in_keys[1:], self.tensor_keys.done):
