@@ -29,6 +29,11 @@ class Proposal(NamedTuple):
     Attributes:
         mean: of shape ``(*B, H, A)``, inside the bounds.
         std: of shape ``(*B, H, A)``, positive.
+
+    Examples:
+        >>> import torch
+        >>> Proposal(torch.zeros(5, 2), torch.ones(5, 2)).mean.shape
+        torch.Size([5, 2])
     """
 
     mean: Tensor
@@ -43,6 +48,12 @@ class Plan(NamedTuple):
         std: spread of the last proposal, of shape ``(*B, H, A)``.
         best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
         best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite.
+
+    Examples:
+        >>> import torch
+        >>> plan = torch.zeros(5, 2)
+        >>> Plan(plan, torch.ones(5, 2), plan, torch.tensor(0.5)).best_cost
+        tensor(0.5000)
     """
 
     actions: Tensor
