@@ -96,7 +96,7 @@ class Settings:
     latent_dim: int = option(4, "size of the latent, no larger than the signal's")
     skips: list[int] = option([1, 4, 16], "prediction steps that are learned together")
     skip_weights: list[float] = option([0.1, 0.3, 0.6], "their weights: long skips tell the distractor apart")
-    restarts: int = option(4, "VJEPAs and JEPAs trained side by side; the objective chooses one")
+    restarts: int = option(8, "VJEPAs and JEPAs trained side by side; the objective chooses one")
     train_steps: int = option(600, "optimiser steps")
     windows: int = option(32, "windows in a batch")
     window: int = option(20, "steps in a window, more than the largest skip")

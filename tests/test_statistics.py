@@ -1,4 +1,4 @@
-"""Moments, Gaussian entropy and effective rank against NumPy, closed forms and invariances."""
+"""Moments, entropy, effective rank and the sliced distance against NumPy and closed forms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, masked_moments
+from torchrl_vjepa.statistics import (
+    effective_rank,
+    gaussian_entropy,
+    masked_moments,
+    sliced_gaussian_distance,
+)
 
 FUNCTIONS = [effective_rank, gaussian_entropy, lambda x, mask=None: masked_moments(x, mask)[1]]
 
@@ -257,3 +262,158 @@ def test_compiles_into_one_graph(function: Callable[..., Tensor]) -> None:
     mask = torch.rand(8, 5) < 0.7
     compiled = torch.compile(function, backend="eager", fullgraph=True)
     torch.testing.assert_close(compiled(x, mask), function(x, mask))
+
+
+# --- the sliced distance
+
+NULL = 1 - 1 / math.sqrt(3)  # n times the mean for samples of N(0, I)
+
+
+def _epps_pulley(x: Tensor) -> Tensor:
+    """The integral in closed form, for samples (n,) of one projection: O(n^2)."""
+    pairs = torch.exp(-0.5 * (x[:, None] - x[None, :]).square()).mean()
+    return pairs - math.sqrt(2) * torch.exp(-0.25 * x.square()).mean() + 1 / math.sqrt(3)
+
+
+@pytest.mark.parametrize(("shift", "scale"), [(0.0, 1.0), (0.0, 0.0), (2.0, 0.3), (-1.0, 3.0)])
+def test_sliced_distance_equals_the_closed_form_in_one_dimension(shift: float, scale: float) -> None:
+    """The only slice of a line is the line itself."""
+    x = (shift + scale * torch.randn(60, dtype=torch.float64)).unsqueeze(-1)
+    ours = sliced_gaussian_distance(x, num_slices=3, num_points=40)
+    torch.testing.assert_close(ours, _epps_pulley(x[:, 0]), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(sliced_gaussian_distance(x), ours, rtol=1e-3, atol=1e-5)
+
+
+def test_sliced_distance_is_the_mean_over_the_drawn_directions() -> None:
+    x = torch.randn(50, 4, dtype=torch.float64) @ torch.randn(4, 4, dtype=torch.float64) + 1
+    ours = sliced_gaussian_distance(x, num_slices=9, generator=torch.Generator().manual_seed(3))
+    directions = torch.randn(4, 9, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    each = [_epps_pulley(x @ a / a.norm()) for a in directions.unbind(1)]
+    torch.testing.assert_close(ours, torch.stack(each).mean(), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 32])
+def test_sliced_distance_vanishes_for_the_unit_gaussian_alone(dim: int) -> None:
+    """Mean (1 - 3^-1/2) / n under the unit Gaussian: zero in the limit."""
+    for n in (20, 200):
+        generator = torch.Generator().manual_seed(dim + n)
+        draws = torch.randn(200, n, dim, generator=generator, dtype=torch.float64)
+        options = {"num_slices": 8, "generator": generator}
+        values = torch.stack([sliced_gaussian_distance(x, **options) for x in draws])
+        assert abs(values.mean() - NULL / n) < 4 * values.std() / math.sqrt(len(values))
+
+
+@pytest.mark.parametrize(
+    "kind", ["collapsed", "one direction", "narrow", "wide", "shifted", "signs", "uniform"]
+)
+def test_sliced_distance_sees_what_is_not_a_unit_gaussian(kind: str) -> None:
+    """Also where mean and covariance are those of the unit Gaussian: the moment form sees nothing there."""
+    n, dim = 4000, 2
+    x = torch.randn(n, dim, dtype=torch.float64)
+    latents = {
+        "collapsed": 0 * x,
+        "one direction": x * torch.tensor([1.0, 0.0]),
+        "narrow": 0.5 * x,
+        "wide": 2 * x,
+        "shifted": x + torch.tensor([0.5, 0.0]),
+        "signs": x.sign(),
+        "uniform": math.sqrt(3) * (2 * torch.rand(n, dim, dtype=torch.float64) - 1),
+    }[kind]
+    values = [sliced_gaussian_distance(latents).item() for _ in range(3)]
+    assert min(values) > 5 * NULL / n
+    if kind == "collapsed":
+        expected = 1 - math.sqrt(2) + 1 / math.sqrt(3)
+        assert values == pytest.approx([expected] * 3, abs=1e-5)
+
+
+def test_sliced_distance_pushes_a_collapsed_batch_apart() -> None:
+    """Descent from a nearly collapsed batch ends at a round one of unit scale."""
+    x = (1e-2 * torch.randn(200, 4, dtype=torch.float64)).requires_grad_()
+    (gradient,) = torch.autograd.grad(sliced_gaussian_distance(x), x)
+    step = -(gradient - gradient.mean(0))
+    assert (step * (x - x.mean(0))).sum() > 0  # outwards
+    optimizer = torch.optim.Adam([x], 0.05)
+    for _ in range(100):
+        optimizer.zero_grad()
+        sliced_gaussian_distance(x).backward()
+        optimizer.step()
+    mean, covariance = masked_moments(x.detach())
+    torch.testing.assert_close(covariance, torch.eye(4, dtype=torch.float64), rtol=0, atol=0.25)
+    assert mean.abs().max() < 0.2
+    assert sliced_gaussian_distance(x) < 2 * NULL / 200
+
+
+def test_sliced_distance_is_differentiable() -> None:
+    x = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
+    mask = torch.tensor([True, False, True, True, True, False])
+
+    def value(x: Tensor) -> Tensor:
+        return sliced_gaussian_distance(x, mask, generator=torch.Generator().manual_seed(0))
+
+    assert torch.autograd.gradcheck(value, [x])
+
+
+@pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("keepdim", [False, True])
+def test_sliced_distance_of_masked_rows_is_that_of_the_others(garbage: float, keepdim: bool) -> None:
+    x = torch.randn(5, 6, 3, dtype=torch.float64)
+    mask = torch.rand(5, 6) < 0.6
+    spoilt = torch.where(mask.unsqueeze(-1), x, garbage).requires_grad_()
+    generators = [torch.Generator().manual_seed(1) for _ in range(2)]
+    ours = sliced_gaussian_distance(spoilt, mask.unsqueeze(-1) if keepdim else mask, generator=generators[0])
+    torch.testing.assert_close(ours, sliced_gaussian_distance(x[mask], generator=generators[1]))
+    ours.backward()
+    assert not spoilt.grad[~mask].any()
+    assert spoilt.grad[mask].all()
+    assert sliced_gaussian_distance(spoilt, torch.zeros_like(mask)) == 0
+
+
+def test_sliced_distance_draws_from_the_given_generator_alone() -> None:
+    x = torch.randn(20, 5)
+    state = torch.get_rng_state()
+    values = [sliced_gaussian_distance(x, generator=torch.Generator().manual_seed(s)) for s in (0, 0, 1)]
+    assert torch.equal(torch.get_rng_state(), state)
+    assert values[0] == values[1] != values[2]
+    assert sliced_gaussian_distance(x) != sliced_gaussian_distance(x)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_vmap_of_the_sliced_distance_equals_a_loop(masked: bool) -> None:
+    """The maps share the directions: adding a run changes no other."""
+    x = torch.randn(3, 8, 5, 4, dtype=torch.float64)
+    arguments = (x, torch.rand(3, 8, 5) < 0.7) if masked else (x,)
+    torch.manual_seed(5)
+    mapped = torch.func.vmap(sliced_gaussian_distance, randomness="same")(*arguments)
+    for i in range(3):
+        torch.manual_seed(5)
+        torch.testing.assert_close(sliced_gaussian_distance(*[a[i] for a in arguments]), mapped[i])
+
+
+def test_sliced_distance_in_half_precision_and_compiled() -> None:
+    x = torch.randn(40, 4)
+    torch.manual_seed(5)
+    exact = sliced_gaussian_distance(x)
+    torch.manual_seed(5)
+    half = sliced_gaussian_distance(x.bfloat16())
+    assert half.dtype == torch.float32
+    torch.testing.assert_close(half, exact, rtol=0.05, atol=1e-4)
+    torch.manual_seed(5)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(sliced_gaussian_distance(x), exact)
+    torch.manual_seed(5)
+    mask = torch.ones(40, dtype=torch.bool)
+    compiled = torch.compile(sliced_gaussian_distance, backend="eager", fullgraph=True)
+    torch.testing.assert_close(compiled(x, mask), exact)
+
+
+def test_sliced_distance_refuses_bad_input() -> None:
+    x = torch.randn(4, 3)
+    with pytest.raises(ValueError, match="num_slices must be at least 1, got 0"):
+        sliced_gaussian_distance(x, num_slices=0)
+    with pytest.raises(ValueError, match="num_points must be at least 2, got 1"):
+        sliced_gaussian_distance(x, num_points=1)
+    with pytest.raises(TypeError, match="floating point"):
+        sliced_gaussian_distance(x.long())
+    with pytest.raises(ValueError, match="mask must have shape"):
+        sliced_gaussian_distance(x, torch.ones(3, dtype=torch.bool))
+    assert sliced_gaussian_distance(x / 0.0 * 0.0).isnan()

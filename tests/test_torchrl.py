@@ -21,10 +21,14 @@ from torchrl.objectives.common import LossModule
 from torchrl.trainers import TargetNetUpdaterHook, Trainer
 
 from torchrl_vjepa import (
+    BJEPA,
     JEPA,
+    VAE,
     VJEPA,
     BatchedNoisyTVEnv,
+    BJEPALoss,
     DeltaHead,
+    GaussianPrior,
     JEPALoss,
     PixelAR,
     PixelARLoss,
@@ -33,6 +37,7 @@ from torchrl_vjepa import (
     QuadraticReward,
     RewardLoss,
     TargetScale,
+    VAELoss,
     VJEPALoss,
     linear_encoder,
     mlp_encoder,
@@ -41,7 +46,13 @@ from torchrl_vjepa import (
 # The observation's size is the batch's and the window's: dispatch must not be fooled by it.
 OBS, LATENT, ACTION = 5, 3, 2
 ROWS, STEPS = 5, 5
-REGULARISERS = {"variance_coeff": 0.5, "covariance_coeff": 0.3, "marginal_entropy_coeff": 0.2}
+REGULARISERS = {
+    "variance_coeff": 0.5,
+    "covariance_coeff": 0.3,
+    "marginal_entropy_coeff": 0.2,
+    "sliced_entropy_coeff": 0.4,
+}
+OF_THE_BATCH = {"loss_variance", "loss_covariance", "loss_entropy", "loss_sliced"}  # statistics
 SKIPS = (1, 2)
 
 
@@ -72,6 +83,24 @@ def _list_loss(**kwargs: Any) -> LossModule:
     return VJEPALoss([_vjepa(), _vjepa()], **REGULARISERS, **kwargs)
 
 
+def _bjepa() -> BJEPA:
+    prior = GaussianPrior(LATENT, mean=0.3, std=0.6, learnable=True)
+    return BJEPA(
+        _encoder(),
+        Predictor(LATENT, ACTION, skips=SKIPS),
+        structural_prior=prior,
+        target_scale=TargetScale(LATENT, init_std=0.5),
+    )
+
+
+def _structural_loss(**kwargs: Any) -> LossModule:
+    return BJEPALoss(_bjepa(), **REGULARISERS, **kwargs)
+
+
+def _structural_list_loss(**kwargs: Any) -> LossModule:
+    return BJEPALoss([_bjepa(), _bjepa()], skip_weights=(1.0, 2.0), **REGULARISERS, **kwargs)
+
+
 def _reward_loss(**kwargs: Any) -> LossModule:
     head = QuadraticReward(LATENT, ACTION)
     torch.nn.init.normal_(head.linear)
@@ -83,13 +112,27 @@ def _pixel_loss(**kwargs: Any) -> LossModule:
     return PixelARLoss(PixelAR(encoder, PixelDecoder(encoder, LATENT, OBS, ACTION)), **kwargs)
 
 
+def _pixel_list_loss(**kwargs: Any) -> LossModule:
+    encoders = [_encoder(), _encoder()]
+    models = [PixelAR(e, PixelDecoder(e, LATENT, OBS, ACTION)) for e in encoders]
+    return PixelARLoss(models, **kwargs)
+
+
+def _vae_loss(**kwargs: Any) -> LossModule:
+    return VAELoss(VAE(OBS, LATENT), **kwargs)
+
+
 BUILDERS = {
     "JEPALoss": _jepa_loss,
     "VJEPALoss head": _head_loss,
     "VJEPALoss batch": _batch_loss,
     "VJEPALoss list": _list_loss,
+    "BJEPALoss": _structural_loss,
+    "BJEPALoss list": _structural_list_loss,
     "RewardLoss": _reward_loss,
     "PixelARLoss": _pixel_loss,
+    "PixelARLoss list": _pixel_list_loss,
+    "VAELoss": _vae_loss,
 }
 JOINT = [name for name in BUILDERS if "JEPA" in name]
 EVERY = pytest.mark.parametrize("name", BUILDERS)
@@ -140,7 +183,7 @@ def test_set_keys(name: str) -> None:
     expected = seeded(loss, windows)
     renamed = windows.rename_key_("is_init", "begin").rename_key_(("next", "done"), ("next", "end"))
     without = seeded(loss, renamed)
-    if name != "RewardLoss":  # one step of imagination never crosses an end
+    if name not in ("RewardLoss", "VAELoss"):  # neither one step of imagination nor none crosses an end
         assert not torch.isclose(total(without), total(expected), rtol=1e-6)
     loss.set_keys(is_init="begin", done=("next", "end"))
     assert loss.tensor_keys.is_init == "begin"
@@ -232,11 +275,11 @@ def test_reductions(name: str) -> None:
         assert list(results[reduction].keys()) == loss.out_keys
     assert all(key.startswith("loss_") for key in results["none"].keys())  # noqa: SIM118
     lead = (2,) if "list" in name else ()
-    per_pair = {"loss_nll", "loss_head", "loss_prediction", "loss_reconstruction"}
+    per_pair = {"loss_nll", "loss_head", "loss_prediction", "loss_reconstruction", "loss_structural_kl"}
     for key, value in results["none"].items():
         assert value.shape == (*lead, ROWS, STEPS)
         summed, mean = results["sum"][key], results["mean"][key]
-        if key in {"loss_variance", "loss_covariance", "loss_entropy"}:  # statistics of the batch
+        if key in OF_THE_BATCH:
             torch.testing.assert_close(value, mean.reshape(*lead, 1, 1).expand_as(value))
             torch.testing.assert_close(summed, mean)
             continue
@@ -423,7 +466,9 @@ def test_coefficients_are_schedulable(name: str) -> None:
     loss = make_loss(name)
     windows = make_windows()
     pairs = {"marginal_entropy_coeff": "loss_entropy", "variance_coeff": "loss_variance"}
-    pairs["covariance_coeff"] = "loss_covariance"
+    pairs |= {"covariance_coeff": "loss_covariance", "sliced_entropy_coeff": "loss_sliced"}
+    if "BJEPA" in name:
+        pairs["structural_kl_coeff"] = "loss_structural_kl"
     pairs["prediction_coeff" if name == "JEPALoss" else "target_kl_coeff"] = (
         "loss_prediction" if name == "JEPALoss" else "loss_target_kl"
     )
@@ -435,7 +480,9 @@ def test_coefficients_are_schedulable(name: str) -> None:
         torch.testing.assert_close(seeded(loss, windows)[key], 0.125 * unit)
 
 
-@pytest.mark.parametrize("name", ["VJEPALoss batch", "VJEPALoss list", "RewardLoss", "PixelARLoss"])
+@pytest.mark.parametrize(
+    "name", ["VJEPALoss batch", "BJEPALoss list", "RewardLoss", "PixelARLoss", "VAELoss"]
+)
 @pytest.mark.filterwarnings("ignore:.*inline_inbuilt_nn_modules:FutureWarning")  # tensordict's own,
 @pytest.mark.filterwarnings("ignore:Using lock_:UserWarning")  # under vmap
 def test_compiles_as_one_graph(name: str) -> None:
@@ -461,19 +508,21 @@ class _Log:
         self.logged[name] = float(value)
 
 
-@pytest.mark.parametrize("build", [JEPALoss, VJEPALoss, RewardLoss, PixelARLoss])
+@pytest.mark.parametrize("build", [JEPALoss, VJEPALoss, BJEPALoss, RewardLoss, PixelARLoss, VAELoss])
 @pytest.mark.filterwarnings("ignore:The 'optimizer' hook stage:FutureWarning")  # Trainer's own
 def test_trains_under_the_trainer(build: Callable[..., Any]) -> None:
     """Collector, loss, optimizer and EMA hook of TorchRL, as they come."""
     env = BatchedNoisyTVEnv(4, noise_scale=1.0, seed=0)
     encoder = linear_encoder(20, LATENT)
-    model: Any = VJEPA(encoder, Predictor(LATENT, ACTION))
+    model: Any = BJEPA(encoder, Predictor(LATENT, ACTION))
     if build is PixelARLoss:
         model = PixelAR(encoder, PixelDecoder(encoder, LATENT, 20, ACTION))
+    if build is VAELoss:
+        model = VAE(20, LATENT)
     head = TensorDictModule(QuadraticReward(LATENT, ACTION), ["latent", "action"], ["reward"])
     loss = RewardLoss(model, head) if build is RewardLoss else build(model)
     before = copy.deepcopy(loss.state_dict())
-    targets = build in (JEPALoss, VJEPALoss)
+    targets = build in (JEPALoss, VJEPALoss, BJEPALoss)
     updater = SoftUpdate(loss, eps=0.9) if targets else None
     logger = _Log()
     trainer = Trainer(

@@ -20,7 +20,7 @@ from torchrl_vjepa.objectives import BJEPALoss, CollapseWarning, JEPALoss, Rewar
 from torchrl_vjepa.planners import CEM, MPPI, Planner, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
-from torchrl_vjepa.statistics import effective_rank, gaussian_entropy
+from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
@@ -76,4 +76,5 @@ __all__ = [
     "quadratic_cost",
     "rollout",
     "sample",
+    "sliced_gaussian_distance",
 ]

@@ -69,8 +69,6 @@ class PixelDecoder(TensorDictModuleBase):
                 "latent_dim and observation_dim must be positive and action_dim at least 0, got "
                 f"{latent_dim}, {observation_dim} and {action_dim}"
             )
-        if trunk not in ("linear", "mlp"):
-            raise ValueError(f"trunk must be 'linear' or 'mlp', got {trunk!r}")
         if len(encoder.in_keys) != 1:
             raise ValueError(
                 "encoder must read one key, the observation: it encodes predicted observations again; "
@@ -97,15 +95,7 @@ class PixelDecoder(TensorDictModuleBase):
         Raises:
             ValueError: if a shape does not fit.
         """
-        if not latent.ndim or latent.shape[-1] != self.latent_dim:
-            raise ValueError(f"latent must have shape (*B, {self.latent_dim}), got {tuple(latent.shape)}")
-        expected = (*latent.shape[:-1], self.action_dim)
-        if (action is None and self.action_dim) or (action is not None and tuple(action.shape) != expected):
-            raise ValueError(
-                f"action must have shape {expected} (None for action_dim=0), got "
-                f"{None if action is None else tuple(action.shape)}"
-            )
-        return self.decoder(latent if action is None else torch.cat([latent, action], dim=-1))
+        return self.decoder(_joined(latent, action, self.latent_dim, self.action_dim))
 
     def dist(self, latent: Tensor, action: Tensor | None = None) -> Delta:
         """The latent transition: decode, then encode.
@@ -168,6 +158,13 @@ class PixelAR(LatentModel):
             raise ValueError("decoder must have been made with this very encoder: PixelDecoder(encoder, ...)")
         super().__init__(encoder, decoder)
 
+    @property
+    def decoder_module(self) -> TensorDictModule:
+        """The decoder alone, without the encoder that its transition needs: what a loss trains."""
+        decoder = self.predictor
+        trunk = _Decode(decoder.decoder, decoder.latent_dim, decoder.action_dim)
+        return TensorDictModule(trunk, in_keys=decoder.in_keys, out_keys=["prediction"])
+
 
 class VAE(TensorDictModuleBase):
     r"""Variational autoencoder of single observations: the static baseline of the noisy TV.
@@ -206,6 +203,10 @@ class VAE(TensorDictModuleBase):
         latent_key: NestedKey = "latent",
     ) -> None:
         super().__init__()
+        if min(observation_dim, latent_dim) < 1:
+            raise ValueError(
+                f"observation_dim and latent_dim must be positive, got {observation_dim} and {latent_dim}"
+            )
         self.encoder = TensorDictModule(
             _trunk(trunk, observation_dim, 2 * latent_dim, num_cells),
             in_keys=[observation_key],
@@ -229,8 +230,12 @@ class VAE(TensorDictModuleBase):
 
         Returns:
             The same tensordict with the latent.
+
+        Raises:
+            KeyError: if there is no observation.
         """
-        posterior = self.encoder.module(tensordict.get(self.in_keys[0]))
+        observation = read(tensordict, self.in_keys[0], reader=type(self).__name__)
+        posterior = self.encoder.module(observation)
         return tensordict.set(self.latent_key, posterior[..., : self.latent_dim])
 
 
@@ -299,7 +304,10 @@ class VAELoss(WindowLoss):
         observation = data.get(self.encoder.in_keys[0])
         mask, length = masks.get("steps"), observation.shape[1]
         with encoder_params.to_module(self.encoder):
-            mean, log_var = self.encoder.module(observation).chunk(2, dim=-1)
+            posterior = self.encoder.module(observation)
+        if posterior.dtype in (torch.float16, torch.bfloat16):
+            posterior = posterior.float()
+        mean, log_var = posterior.chunk(2, dim=-1)
         latent = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
         with decoder_params.to_module(self.decoder):
             error = (observation - self.decoder.module(latent)).pow(2).sum(-1)
@@ -339,7 +347,7 @@ class PixelARLoss(WindowLoss):
     encoder: TensorDictModuleBase
     encoder_params: TensorDictParams
     target_encoder_params: TensorDictParams
-    decoder: PixelDecoder
+    decoder: TensorDictModule
     decoder_params: TensorDictParams
     target_decoder_params: TensorDictParams
 
@@ -354,7 +362,7 @@ class PixelARLoss(WindowLoss):
     ) -> None:
         super().__init__(
             model,
-            {"encoder": "encoder", "decoder": "predictor"},
+            {"encoder": "encoder", "decoder": "decoder_module"},
             skips=(1,),
             stacked_data=stacked_data,
             reduction=reduction,
@@ -371,19 +379,42 @@ class PixelARLoss(WindowLoss):
     ) -> dict[str, Tensor]:
         encoder_params, decoder_params = params
         observation = data.get(self.encoder.in_keys[0])
-        latent = self._encode(data[:, :-1], encoder_params, self.decoder.latent_key)
-        action = data.get(self.decoder.action_key)[:, :-1] if self.decoder.action_dim else None
+        latent_key, *action_keys = self.decoder.in_keys
+        latent = self._encode(data[:, :-1], encoder_params, latent_key)
+        actions = [data.get(key)[:, :-1] for key in action_keys]
         with decoder_params.to_module(self.decoder):
-            predicted = self.decoder.decode(latent, action)
+            predicted = self.decoder.module(latent, *actions)
         error = (predicted - observation[:, 1:]).pow(2).sum(-1)
         return {"loss_reconstruction": self._reduce([error], [masks.get("1")], observation.shape[1])}
+
+
+class _Decode(nn.Module):
+    """Latent and action, checked and joined, through the trunk of a decoder."""
+
+    def __init__(self, trunk: nn.Module, latent_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.latent_dim, self.action_dim = latent_dim, action_dim
+
+    def forward(self, latent: Tensor, action: Tensor | None = None) -> Tensor:
+        return self.trunk(_joined(latent, action, self.latent_dim, self.action_dim))
+
+
+def _joined(latent: Tensor, action: Tensor | None, latent_dim: int, action_dim: int) -> Tensor:
+    if not latent.ndim or latent.shape[-1] != latent_dim:
+        raise ValueError(f"latent must have shape (*B, {latent_dim}), got {tuple(latent.shape)}")
+    expected = (*latent.shape[:-1], action_dim)
+    if (action is None and action_dim) or (action is not None and tuple(action.shape) != expected):
+        raise ValueError(
+            f"action must have shape {expected} (None for action_dim=0), got "
+            f"{None if action is None else tuple(action.shape)}"
+        )
+    return latent if action is None else torch.cat([latent, action], dim=-1)
 
 
 def _trunk(
     trunk: Literal["linear", "mlp"], in_features: int, out_features: int, num_cells: Sequence[int]
 ) -> nn.Module:
-    if min(in_features, out_features) < 1:
-        raise ValueError(f"sizes must be positive, got {in_features} and {out_features}")
     if trunk == "linear":
         return nn.Linear(in_features, out_features, bias=False)
     if trunk == "mlp":

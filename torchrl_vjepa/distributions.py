@@ -6,6 +6,7 @@ event shape ``(D,)``; the functions here read it in the ways the paper names (me
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -97,11 +98,26 @@ def diag_gaussian(loc: Tensor, scale: Tensor) -> Independent:
         >>> diag_gaussian(torch.zeros(5, 3), torch.ones(3)).event_shape
         torch.Size([3])
     """
-    loc, scale = torch.broadcast_tensors(loc, scale)
     # Under autocast a learned scale keeps its dtype, and torch.normal refuses two.
     dtype = torch.promote_types(loc.dtype, scale.dtype)
-    loc, scale = loc.to(dtype), scale.to(dtype)
-    return Independent(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+    return _DiagGaussian(loc.to(dtype), scale.to(dtype))
+
+
+class _DiagGaussian(Independent):
+    """``Independent(Normal)`` that keeps a scale shared by the batch small: one logarithm, not B."""
+
+    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+        self._scale = scale.expand(*scale.shape[:-1], loc.shape[-1])
+        loc, scale = torch.broadcast_tensors(loc, scale)
+        super().__init__(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        normed = (value - self.base_dist.loc) / self._scale
+        constant = self._scale.log().sum(-1) + 0.5 * value.shape[-1] * math.log(2 * math.pi)
+        return -0.5 * normed.square().sum(-1) - constant
+
+    def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> _DiagGaussian:
+        return _DiagGaussian(self.base_dist.loc.expand(*batch_shape, *self.event_shape), self._scale)
 
 
 def sample(
@@ -223,7 +239,7 @@ def product_of_experts(*experts: Distribution) -> Distribution:
         The product, with the broadcast batch shape.
 
     Raises:
-        ValueError: if there is no expert or event shapes differ.
+        ValueError: if there is no expert, or event shapes differ or are not ``(D,)``.
         TypeError: if an expert is not Gaussian.
 
     Examples:
@@ -235,9 +251,9 @@ def product_of_experts(*experts: Distribution) -> Distribution:
     """
     if not experts:
         raise ValueError("experts must be at least one Gaussian, got none")
-    if len({p.event_shape for p in experts}) != 1:
-        shapes = [tuple(p.event_shape) for p in experts]
-        raise ValueError(f"experts must have the same event shape, got {shapes}")
+    shapes = [tuple(p.event_shape) for p in experts]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 1:
+        raise ValueError(f"experts must have the same event shape (D,), got {shapes}")
     diagonal = [p for p in experts if isinstance(p, Independent) and isinstance(p.base_dist, Normal)]
     full = [p for p in experts if isinstance(p, MultivariateNormal)]
     if len(diagonal) + len(full) != len(experts):

@@ -66,6 +66,7 @@ class GaussianPrior(nn.Module):
                 raise ValueError(
                     f"covariance must have shape {(latent_dim, latent_dim)}, got {tuple(covariance.shape)}"
                 )
+            covariance = covariance.detach().to(entries["mean"].dtype)
             factor, failed = torch.linalg.cholesky_ex(covariance)
             if failed or not torch.allclose(covariance, covariance.mT):
                 raise ValueError("covariance must be symmetric positive definite")

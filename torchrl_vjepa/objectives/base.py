@@ -16,7 +16,12 @@ from torchrl_vjepa.models import JEPA
 from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 from torchrl_vjepa.predictor import Predictor
-from torchrl_vjepa.statistics import covariance_entropy, covariance_rank, masked_moments
+from torchrl_vjepa.statistics import (
+    covariance_entropy,
+    covariance_rank,
+    masked_moments,
+    sliced_gaussian_distance,
+)
 from torchrl_vjepa.windows import action_chunks
 
 __all__ = ["CollapseWarning", "LatentPredictionLoss"]
@@ -56,13 +61,19 @@ class LatentPredictionLoss(WindowLoss):
             (``thm:mi_bound``) in its moment form,
             :math:`\mathrm{KL}(\mathcal N(m, S) \,\|\, \mathcal N(0, I))` of the aggregate latent
             moments: it maximises the Gaussian entropy :math:`\frac12 \log\det S` and keeps the scale.
+        sliced_entropy_coeff: weight of the entropy term in its sliced form (SIGReg,
+            :func:`~torchrl_vjepa.statistics.sliced_gaussian_distance`), for latents of many dimensions:
+            the entry ``loss_sliced``. ``None`` leaves it out; with a number it can be scheduled, also
+            from 0.
+        num_slices: number of random directions of the sliced form.
         collapse_rank: a :class:`CollapseWarning` is given once when the effective rank of the latents
             falls under it; 0 for never.
         reduction: ``"mean"`` over pairs and skips, ``"sum"`` over pairs (mean over skips), or
             ``"none"``: losses of shape ``(B, T)``, without scalar diagnostics.
 
     Raises:
-        ValueError: if a coefficient is negative or not finite, or ``reduction`` is unknown.
+        ValueError: if a coefficient is negative or not finite, ``num_slices`` is not positive, or
+            ``reduction`` is unknown.
 
     Examples:
         >>> from torchrl_vjepa import JEPALoss
@@ -76,8 +87,11 @@ class LatentPredictionLoss(WindowLoss):
     predictor: Predictor
     predictor_params: TensorDictParams
     target_predictor_params: TensorDictParams
+    sliced_entropy_coeff: Tensor | None
 
-    _schedulable_buffers = frozenset({"variance_coeff", "covariance_coeff", "marginal_entropy_coeff"})
+    _schedulable_buffers = frozenset(
+        {"variance_coeff", "covariance_coeff", "marginal_entropy_coeff", "sliced_entropy_coeff"}
+    )
     _model_type = JEPA
     #: The effective rank is compared with ``collapse_rank`` in every so many calls: it makes a GPU wait.
     collapse_interval: int = 20
@@ -92,6 +106,8 @@ class LatentPredictionLoss(WindowLoss):
         variance_coeff: float = 0.0,
         covariance_coeff: float = 0.0,
         marginal_entropy_coeff: float = 0.0,
+        sliced_entropy_coeff: float | None = None,
+        num_slices: int = 64,
         collapse_rank: float = 1.2,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
@@ -113,6 +129,14 @@ class LatentPredictionLoss(WindowLoss):
         self._register_coeff("variance_coeff", variance_coeff)
         self._register_coeff("covariance_coeff", covariance_coeff)
         self._register_coeff("marginal_entropy_coeff", marginal_entropy_coeff)
+        if num_slices < 1:
+            raise ValueError(f"num_slices must be positive, got {num_slices}")
+        self.num_slices = num_slices
+        if sliced_entropy_coeff is None:
+            # An empty buffer, so that assigning a number later is an error instead of being ignored.
+            self.register_buffer("sliced_entropy_coeff", None)
+        else:
+            self._register_coeff("sliced_entropy_coeff", sliced_entropy_coeff)
         self.collapse_rank = float(collapse_rank)
         self._calls = 0
         self._warned = False
@@ -122,6 +146,8 @@ class LatentPredictionLoss(WindowLoss):
 
     def _loss_keys(self) -> Iterator[str]:
         yield from ("loss_variance", "loss_covariance", "loss_entropy")
+        if self.sliced_entropy_coeff is not None:
+            yield "loss_sliced"
 
     def _diagnostic_keys(self) -> Iterator[str]:
         yield from ("effective_rank", "latent_std")
@@ -183,6 +209,9 @@ class LatentPredictionLoss(WindowLoss):
         with torch.autocast(latent.device.type, enabled=False):
             mean, covariance = masked_moments(latent, mask)
             terms.update(self._regularisers(mean, covariance))
+            if self.sliced_entropy_coeff is not None:
+                distance = sliced_gaussian_distance(latent, mask, num_slices=self.num_slices)
+                terms["loss_sliced"] = self.sliced_entropy_coeff * distance
             if self.reduction != "none":
                 covariance = covariance.detach()
                 terms["effective_rank"] = covariance_rank(covariance)

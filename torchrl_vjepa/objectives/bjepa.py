@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
-from torch.distributions import kl_divergence
+from torch.distributions import Distribution, Independent, MultivariateNormal, kl_divergence
 
 from torchrl_vjepa.models import BJEPA
 from torchrl_vjepa.objectives.pairs import Pairs
@@ -28,7 +28,8 @@ class BJEPALoss(VJEPALoss):
     :math:`p_{\text{struct}}` is the model's ``structural_prior``; a learned one moves with this term
     alone. The reference prior of the :math:`\beta` term is :math:`\mathcal N(0, I)`.
 
-    Entries: those of :class:`VJEPALoss` and ``loss_structural_kl``; diagnostic ``structural_kl``.
+    Entries: those of :class:`VJEPALoss` and ``loss_structural_kl``; diagnostic ``structural_kl``
+    (in nats, without :math:`\gamma`).
 
     Args:
         model: the model, or a list of models that train as one batch.
@@ -82,9 +83,17 @@ class BJEPALoss(VJEPALoss):
         terms = super()._member_terms(pairs, target_latent, data, mask, params)
         with params["prior"].to_module(self.prior):
             prior = self.prior.module()
-            kls = [kl_divergence(pair.dist, prior.expand(pair.dist.batch_shape)) for pair in pairs]
+            kls = [_kl(pair.dist, prior) for pair in pairs]
         terms["loss_structural_kl"] = self.structural_kl_coeff * self._reduce_pairs(kls, pairs)
         if self.reduction != "none":
             means = [pair.mean(kl) for pair, kl in zip(pairs, kls, strict=True)]
-            terms["structural_kl"] = torch.stack(means).mean().detach()
+            weighted = [w * mean for w, mean in zip(self.skip_weights, means, strict=True)]
+            terms["structural_kl"] = torch.stack(weighted).sum().detach()
         return terms
+
+
+def _kl(p: Distribution, prior: Distribution) -> Tensor:
+    if isinstance(prior, MultivariateNormal) and isinstance(p, Independent):
+        # torch has no divergence between a diagonal and a full Gaussian.
+        p = MultivariateNormal(p.mean, scale_tril=torch.diag_embed(p.stddev), validate_args=False)
+    return kl_divergence(p, prior.expand(p.batch_shape))

@@ -25,8 +25,9 @@ class JEPALoss(LatentPredictionLoss):
     where :math:`g_\phi` is the predictive mean. The paper's JEPA adds VICReg: ``prediction_coeff=25/D``
     (VICReg averages the square over the D dimensions), ``variance_coeff=25``, ``covariance_coeff=1``.
 
-    Entries: ``loss_prediction``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``; diagnostics
-    ``effective_rank``, ``latent_std``, ``error_skip_<k>``.
+    Entries: ``loss_prediction``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``, with
+    ``sliced_entropy_coeff`` also ``loss_sliced``; diagnostics ``effective_rank``, ``latent_std``,
+    ``error_skip_<k>``.
 
     Args:
         model: the model, or a list of models that train as one batch (:class:`LatentPredictionLoss`).
@@ -36,6 +37,8 @@ class JEPALoss(LatentPredictionLoss):
         variance_coeff: weight of VICReg's variance term.
         covariance_coeff: weight of VICReg's covariance term.
         marginal_entropy_coeff: weight of the aggregate moments' KL to the unit Gaussian.
+        sliced_entropy_coeff: weight of the entropy term in its sliced form (SIGReg); ``None`` for none.
+        num_slices: number of random directions of the sliced form.
         collapse_rank: effective rank under which a :class:`CollapseWarning` is given.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
@@ -70,6 +73,8 @@ class JEPALoss(LatentPredictionLoss):
         variance_coeff: float = 0.0,
         covariance_coeff: float = 0.0,
         marginal_entropy_coeff: float = 0.0,
+        sliced_entropy_coeff: float | None = None,
+        num_slices: int = 64,
         collapse_rank: float = 1.2,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
@@ -80,6 +85,8 @@ class JEPALoss(LatentPredictionLoss):
             variance_coeff=variance_coeff,
             covariance_coeff=covariance_coeff,
             marginal_entropy_coeff=marginal_entropy_coeff,
+            sliced_entropy_coeff=sliced_entropy_coeff,
+            num_slices=num_slices,
             collapse_rank=collapse_rank,
             reduction=reduction,
         )

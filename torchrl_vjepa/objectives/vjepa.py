@@ -36,7 +36,8 @@ class VJEPALoss(LatentPredictionLoss):
     by EMA, its scale learns as ``target_scale_gradient`` says.
 
     Entries: ``loss_nll``, ``loss_target_kl``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``,
-    with ``residual_variance="batch"`` also ``loss_head``. Diagnostics:
+    with ``residual_variance="batch"`` also ``loss_head``, with ``sliced_entropy_coeff`` also
+    ``loss_sliced``. Diagnostics:
     ``effective_rank``, ``latent_std``, ``target_std``, ``mutual_information`` (the Gaussian form of
     the bound of ``thm:mi_bound``, in nats, mean over skips: the score by which restarts are chosen),
     ``nll_skip_<k>``.
@@ -59,6 +60,8 @@ class VJEPALoss(LatentPredictionLoss):
         covariance_coeff: weight of VICReg's covariance term.
         marginal_entropy_coeff: weight of the aggregate moments' KL to the unit Gaussian: the entropy
             term of the mutual information bound.
+        sliced_entropy_coeff: weight of the entropy term in its sliced form (SIGReg); ``None`` for none.
+        num_slices: number of random directions of the sliced form.
         collapse_rank: effective rank under which a :class:`CollapseWarning` is given.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
@@ -106,6 +109,8 @@ class VJEPALoss(LatentPredictionLoss):
         variance_coeff: float = 0.0,
         covariance_coeff: float = 0.0,
         marginal_entropy_coeff: float = 0.0,
+        sliced_entropy_coeff: float | None = None,
+        num_slices: int = 64,
         collapse_rank: float = 1.2,
         reduction: Literal["mean", "sum", "none"] = "mean",
     ) -> None:
@@ -124,6 +129,8 @@ class VJEPALoss(LatentPredictionLoss):
             variance_coeff=variance_coeff,
             covariance_coeff=covariance_coeff,
             marginal_entropy_coeff=marginal_entropy_coeff,
+            sliced_entropy_coeff=sliced_entropy_coeff,
+            num_slices=num_slices,
             collapse_rank=collapse_rank,
             reduction=reduction,
         )
@@ -180,7 +187,7 @@ class VJEPALoss(LatentPredictionLoss):
         # KL(q || N(0, I)) per step; every step that counts is some pair's target or could be.
         std = self._target_std(data, params)
         variance = std.pow(2)
-        kl = 0.5 * (variance + target_latent.pow(2) - 1 - variance.log()).sum(-1)
+        kl = 0.5 * (target_latent.pow(2).sum(-1) + (variance - 1 - variance.log()).sum(-1))
         terms["loss_target_kl"] = self.target_kl_coeff * self._reduce([kl], [mask], kl.shape[1])
 
         if self.reduction != "none":

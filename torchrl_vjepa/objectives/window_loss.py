@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
@@ -44,7 +44,8 @@ class WindowLoss(LossModule):
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
     Raises:
-        ValueError: if the list is empty, ``stacked_data`` is set for a single model, or ``reduction`` is
+        ValueError: if the list is empty, its models differ in architecture or share parameters,
+            ``stacked_data`` is set for a single model, or ``reduction`` is
             unknown.
 
     Examples:
@@ -97,14 +98,25 @@ class WindowLoss(LossModule):
         self._modules_of_model = dict(modules)
         for name, attribute in modules.items():
             parts = [getattr(m, attribute) for m in models]
+            stacked = len(parts) > 1
             self.convert_to_functional(
-                parts if several else parts[0],
+                parts if stacked else parts[0],
                 name,
-                expand_dim=len(parts) if several else None,
+                expand_dim=len(parts) if stacked else None,
                 create_target_params=name in targets,
             )
+            if several and not stacked:
+                self._stack_one(name, parts[0], name in targets)
         self._set_in_keys()
         self._out_keys: list[NestedKey] | None = None
+
+    def _stack_one(self, name: str, part: torch.nn.Module, has_target: bool) -> None:
+        # Of a list of one TorchRL makes tensors that are no parameters: it takes them for shared ones.
+        params = TensorDict.from_modules(part, as_module=True, expand_identical=False)
+        setattr(self, f"{name}_params", params)
+        if has_target:
+            target = TensorDictParams(params.data.clone(), no_convert=True)
+            setattr(self, f"target_{name}_params", target)
 
     @classmethod
     def _checked(cls, model: Any) -> list[Any]:
@@ -126,6 +138,14 @@ class WindowLoss(LossModule):
                     f"model must be a list of models of one architecture, but the parameters of model {i} "
                     "differ in name or shape from those of model 0"
                 )
+        owner: dict[int, int] = {}
+        for i, m in enumerate(models if len(models) > 1 else ()):
+            for name, parameter in m.named_parameters():
+                if owner.setdefault(id(parameter), i) != i:
+                    raise ValueError(
+                        f"model must be a list of models that share no parameters, but {name!r} of model {i} "
+                        f"is that of model {owner[id(parameter)]}; build one for each"
+                    )
         return models
 
     def _register_coeff(self, name: str, value: float) -> None:

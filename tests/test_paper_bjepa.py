@@ -1,0 +1,250 @@
+"""Identities of the paper about BJEPA, fusion and the reconstructing baseline."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+
+from torchrl_vjepa import (
+    BJEPA,
+    VAE,
+    VJEPA,
+    BJEPALoss,
+    DiagGaussianHead,
+    FusedPredictor,
+    GaussianPrior,
+    Predictor,
+    TargetScale,
+    VAELoss,
+    VJEPALoss,
+    linear_encoder,
+)
+
+
+def make_model(observation_dim: int, latent_dim: int, action_dim: int = 0) -> BJEPA:
+    """Linear, with a constant predicted variance and a target that is a point mass in all but name."""
+    head = DiagGaussianHead("constant", log_var_range=(-40.0, 16.0))
+    scale = TargetScale(latent_dim, kind="constant", init_std=1e-9, log_var_range=(-80.0, 16.0))
+    predictor = Predictor(latent_dim, action_dim, head=head)
+    return BJEPA(linear_encoder(observation_dim, latent_dim), predictor, target_scale=scale).double()
+
+
+def exact_normal(num: int, dim: int) -> Tensor:
+    """Samples with mean exactly zero and covariance exactly the identity."""
+    x = torch.randn(num, dim, dtype=torch.float64)
+    return torch.linalg.qr(x - x.mean(0)).Q * math.sqrt(num)
+
+
+def pairs(context: Tensor, target: Tensor) -> TensorDict:
+    """One window of two steps per sample."""
+    return TensorDict(observation=torch.stack([context, target], 1), batch_size=(len(context), 2))
+
+
+def minimise(loss: VAELoss | VJEPALoss, windows: TensorDict, steps: int, rate: float) -> None:
+    updater = SoftUpdate(loss, eps=0.9) if isinstance(loss, VJEPALoss) else None
+    optimizer = torch.optim.Adam(loss.parameters(), rate)
+    for step in range(steps):
+        for group in optimizer.param_groups:
+            group["lr"] = rate * (1 - step / steps)
+        optimizer.zero_grad()
+        sum(value for key, value in loss(windows).items() if key.startswith("loss_")).backward()
+        optimizer.step()
+        if updater is not None:
+            updater.step()
+
+
+# --- VJEPA as a special case of BJEPA
+
+
+def test_vjepa_is_bjepa_with_an_uninformative_prior() -> None:
+    """p_prior proportional to 1: the posterior predictor is the likelihood itself, exactly."""
+    model = make_model(6, 3)
+    latent = torch.randn(5, 3, dtype=torch.float64)
+    likelihood = model.predictor.dist(latent)
+    flat = FusedPredictor(model.predictor, None).dist(latent)
+    assert torch.equal(flat.mean, likelihood.mean)
+    assert torch.equal(flat.variance, likelihood.variance)
+
+
+def test_a_vague_prior_tends_to_the_uninformative_one() -> None:
+    """The fused mean and variance differ by O(1 / sigma_prior^2)."""
+    model = make_model(6, 3)
+    latent = torch.randn(5, 3, dtype=torch.float64)
+    likelihood = model.predictor.dist(latent)
+    gaps = []
+    for std in (1e1, 1e2, 1e3):
+        p = model.fuse(GaussianPrior(3, mean=2.0, std=std).double()).dist(latent)
+        gaps.append((p.mean - likelihood.mean).abs().max() + (p.variance - likelihood.variance).abs().max())
+    assert gaps[0] > 1e-3
+    for wide, wider in zip(gaps, gaps[1:], strict=False):
+        assert wider.item() == pytest.approx(wide.item() / 100, rel=0.05)
+
+
+def test_bjepa_without_the_structural_term_trains_like_vjepa() -> None:
+    """gamma = 0: the same weights after several steps of Adam and EMA."""
+    model = make_model(6, 3)
+    plain = VJEPA(
+        linear_encoder(6, 3), Predictor(3, head=model.predictor.head), target_scale=model.target_scale.module
+    ).double()
+    plain.encoder.load_state_dict(model.encoder.state_dict())
+    plain.predictor.load_state_dict(model.predictor.state_dict())
+    windows = TensorDict(observation=torch.randn(8, 5, 6, dtype=torch.float64), batch_size=(8, 5))
+    for loss in (BJEPALoss(model, structural_kl_coeff=0.0), VJEPALoss(plain)):
+        torch.manual_seed(3)
+        minimise(loss, windows, 5, 1e-2)
+    shared = {k: v for k, v in model.state_dict().items() if "structural_prior" not in k}
+    torch.testing.assert_close(shared, dict(plain.state_dict()), rtol=0, atol=0)
+
+
+def test_the_structural_term_pulls_the_dynamics_to_the_prior() -> None:
+    """Soft fusion with a constant prediction: argmin NLL + gamma KL, in closed form.
+
+    For targets of mean m and variance v and a unit prior: mu = m / (1 + gamma s^2) and
+    (1 - gamma) / s^2 + gamma = (v + (m - mu)^2) / s^4.
+    """
+    gamma, m, v = 0.5, 2.0, 0.3
+    model = make_model(2, 1)
+    model = BJEPA(
+        model.encoder,
+        model.predictor,
+        structural_prior=GaussianPrior(1).double(),
+        target_scale=model.target_scale.module,
+    )
+    with torch.no_grad():
+        model.encoder.module.network.weight.copy_(torch.tensor([[1.0, 0.0]]))
+    noise = exact_normal(200, 1)
+    # The context is the constant 1, so the trunk's weight is the mean.
+    context = torch.ones(200, 2, dtype=torch.float64)
+    target = torch.cat([m + math.sqrt(v) * noise, noise], 1)
+    loss = BJEPALoss(model, structural_kl_coeff=gamma, target_kl_coeff=0.0, collapse_rank=0.0)
+    SoftUpdate(loss, eps=0.9)
+    optimizer = torch.optim.LBFGS(model.predictor.parameters(), max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        optimizer.zero_grad()
+        terms = loss(pairs(context, target))
+        value = terms["loss_nll"] + terms["loss_structural_kl"]
+        value.backward()
+        return value
+
+    optimizer.step(closure)
+    p = model.predictor.dist(torch.ones(1, 1, dtype=torch.float64))
+    s2 = p.variance.item()
+    mu = p.mean.item()
+    assert mu == pytest.approx(m / (1 + gamma * s2), rel=1e-3)
+    assert (1 - gamma) / s2 + gamma == pytest.approx((v + (m - mu) ** 2) / s2**2, rel=1e-3)
+    assert mu < m - 0.1
+
+
+# --- fusion as filtering
+
+
+def test_hard_fusion_filters_like_kalman() -> None:
+    """Predict with p_phi, update with a measurement as the prior expert; several steps of the filter."""
+    model = make_model(5, 2, action_dim=1)
+    a = torch.tensor([[0.9, 0.3], [-0.3, 0.8]], dtype=torch.float64)
+    b = torch.tensor([[0.5], [1.0]], dtype=torch.float64)
+    q = torch.tensor([0.04, 0.25], dtype=torch.float64)
+    r = torch.tensor([[0.5, 0.2], [0.2, 0.3]], dtype=torch.float64)
+    with torch.no_grad():
+        model.predictor.trunks[0].weight.copy_(torch.cat([a, b], 1))
+        model.predictor.constants[0].copy_(q.log())
+    state = torch.tensor([1.0, -2.0], dtype=torch.float64)
+    for _ in range(3):
+        u = torch.randn(1, dtype=torch.float64)
+        z = torch.randn(2, dtype=torch.float64)
+        measurement = GaussianPrior(2, mean=z, covariance=r).double()
+        post = model.fuse(measurement).dist(state, u)
+        predicted, noise = a @ state + b @ u, q.diag()
+        gain = noise @ torch.linalg.inv(noise + r)
+        torch.testing.assert_close(post.mean, predicted + gain @ (z - predicted), rtol=1e-5, atol=1e-6)
+        covariance = (torch.eye(2, dtype=torch.float64) - gain) @ noise
+        torch.testing.assert_close(post.covariance_matrix, covariance, rtol=1e-5, atol=1e-6)
+        state = post.mean.detach()
+
+
+def test_hard_fusion_lies_between_its_experts_and_is_sharper_than_both() -> None:
+    model = make_model(6, 3)
+    with torch.no_grad():
+        model.predictor.constants.normal_()
+    latent = torch.randn(50, 3, dtype=torch.float64)
+    prior = GaussianPrior(3, mean=1.5, std=torch.tensor([0.2, 1.0, 4.0])).double()
+    likelihood, post = model.predictor.dist(latent), model.fuse(prior).dist(latent)
+    low, high = torch.minimum(likelihood.mean, prior.mean), torch.maximum(likelihood.mean, prior.mean)
+    assert ((post.mean > low) & (post.mean < high)).all()
+    assert (post.variance < torch.minimum(likelihood.variance, prior().variance)).all()
+
+
+# --- nuisance variables
+
+
+def nuisance(num: int) -> tuple[TensorDict, Tensor]:
+    """x = (signal, two unpredictable noises of variances 9 and 4); the signal has variance 1."""
+    a, samples = 0.9, exact_normal(num, 6)
+    following = a * samples[:, :1] + math.sqrt(1 - a**2) * samples[:, 1:2]
+    scale = torch.tensor([3.0, 2.0], dtype=torch.float64)
+    first = torch.cat([samples[:, :1], samples[:, 2:4] * scale], 1)
+    return pairs(first, torch.cat([following, samples[:, 4:] * scale], 1)), samples
+
+
+def test_joint_embedding_discards_the_noise() -> None:
+    """The structural prior leaves nuisance invariance as it is."""
+    windows, _ = nuisance(300)
+    model = make_model(3, 1)
+    with torch.no_grad():
+        model.encoder.module.network.weight.copy_(torch.tensor([[0.2, 0.2, -0.2]]))
+    loss = BJEPALoss(
+        model,
+        structural_kl_coeff=0.1,
+        residual_variance="batch",
+        marginal_entropy_coeff=1.0,
+        target_kl_coeff=0.0,
+        collapse_rank=0.0,
+    )
+    minimise(loss, windows, 250, 0.05)
+    weight = model.encoder.module.network.weight.detach()[0].abs()
+    assert weight[1:].max() < 0.02 * weight[0]
+
+
+@pytest.mark.parametrize("start", ["signal", "random"])
+def test_reconstruction_keeps_the_noise(start: str) -> None:
+    """The optimal linear VAE of the same system: all weight on the noise that varies most.
+
+    Also from the encoder that a joint-embedding model would find: it is a saddle, not a minimum.
+    """
+    windows, _ = nuisance(300)
+    model = VAE(3, 1).double()
+    if start == "signal":
+        with torch.no_grad():
+            model.encoder.module.weight.zero_()
+            model.encoder.module.weight[0, 0] = 1.0
+            model.decoder.module.weight.copy_(torch.tensor([[0.5], [0.0], [0.0]]))
+    minimise(VAELoss(model), windows, 300, 0.06)
+    for weight in (model.encoder.module.weight[0], model.decoder.module.weight[:, 0]):
+        weight = weight.detach().abs()
+        assert weight[0] < 0.1 * weight[1]
+        assert weight[2] < 0.2 * weight[1]
+
+
+def test_the_signal_only_vae_is_worse_than_the_noise_only_one() -> None:
+    """sqrt(2 beta v) - beta / 2 + the variance of what is left out: the least for the largest v."""
+    windows, _ = nuisance(2000)
+    values = {}
+    variances = (1.0, 9.0, 4.0)
+    for kept, v in enumerate(variances):
+        model = VAE(3, 1).double()
+        encoder = math.sqrt((math.sqrt(2 * v) - 1) / v)
+        with torch.no_grad():
+            model.encoder.module.weight.zero_()
+            model.decoder.module.weight.zero_()
+            model.encoder.module.weight[0, kept] = encoder
+            model.decoder.module.weight[kept, 0] = encoder * v / (1 + encoder**2 * v)
+        values[kept] = sum(VAELoss(model)(windows).values()).item()
+        left = sum(variances) - v
+        assert values[kept] == pytest.approx(math.sqrt(2 * v) - 0.5 + left, rel=0.03)
+    assert values[1] < values[2] < values[0]
