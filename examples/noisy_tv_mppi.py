@@ -22,6 +22,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
+from torchrl import logger
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import InitTracker, TransformedEnv
@@ -505,6 +506,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
     for path in (args.out, args.json.parent if args.json else args.out):
         path.mkdir(parents=True, exist_ok=True)
+    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
     # The tensors are small: more threads would only wait for each other.
     torch.set_num_threads(1)
     start = time.perf_counter()
