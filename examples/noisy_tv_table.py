@@ -114,6 +114,11 @@ class Settings:
     train_length: int = option(6000, "steps of the training trajectory")
     test_length: int = option(2000, "steps of the test trajectory")
     steps: int = option(0, "optimiser steps; 0 is 6000 (paper), 400 or with mlp 500 (robust)")
+    r2: str = option(
+        "uniform",
+        "average over components: uniform (the paper's numbers) or weighted by variance (its formula)",
+        choices=["uniform", "weighted"],
+    )
     restarts: int = option(6, "robust: starts trained side by side; the objective chooses one")
     skips: list[int] = option([1, 4, 16], "robust: prediction steps that are learned together")
     skip_weights: list[float] = option([0.1, 0.3, 0.6], "robust: their weights")
@@ -387,22 +392,35 @@ def represent(name: str, model: Any, observations: Tensor) -> tuple[Tensor, Tens
     return p.mean, None if name == "JEPA" else p.variance
 
 
-def probe(latents: Sequence[Tensor], run: Run, ahead: int) -> tuple[Row, Tensor]:
+def r2_score(target: Tensor, prediction: Tensor, average: str) -> float:
+    """Coefficient of determination of several components.
+
+    The paper prints the formula that weighs components by their variance, but its numbers are those of
+    scikit-learn's default, the plain mean over components.
+    """
+    error = (target - prediction).square().sum(0)
+    total = (target - target.mean(0)).square().sum(0)
+    if average == "weighted":
+        return (1 - error.sum() / total.sum()).item()
+    return (1 - error / total).mean().item()
+
+
+def probe(latents: Sequence[Tensor], run: Run, ahead: int, average: str) -> tuple[Row, Tensor]:
     """R2 of signal and noise, and the signal that the probe reads off the test latents."""
     data = (run.train, run.test)
     used = [latent[: len(d) - 1] for latent, d in zip(latents, data, strict=True)]
-    result = {}
-    for key in ("signal", "distractor"):
-        targets = [d[key][ahead : len(d) - 1 + ahead] for d in data]
-        result[key] = linear_probe(used[0], targets[0], used[1], targets[1])
-    noise = result["distractor"] if run.noise_scale else None
-    scores = {
-        "signal_r2_train": result["signal"].r2_train,
-        "signal_r2": result["signal"].r2_test,
-        "noise_r2_train": noise and noise.r2_train,
-        "noise_r2": noise and noise.r2_test,
-    }
-    return scores, result["signal"].predict(used[1][:SHOWN_STEPS])
+    scores: Row = {}
+    curve = used[1]
+    for key, entry in (("distractor", "noise_r2"), ("signal", "signal_r2")):
+        targets = [d[key][ahead : len(d) - 1 + ahead].double() for d in data]
+        fitted = linear_probe(used[0], targets[0], used[1], targets[1])
+        outputs = [fitted.predict(latent) for latent in used]
+        for suffix, target, output in zip(("_train", ""), targets, outputs, strict=True):
+            # Without a distractor there is nothing to find.
+            known = key == "signal" or run.noise_scale > 0
+            scores[entry + suffix] = r2_score(target, output, average) if known else None
+        curve = outputs[1]
+    return scores, curve[:SHOWN_STEPS]
 
 
 def run_task(task: tuple[str, str, int], settings: Settings) -> tuple[list[Row], dict[Any, Any]]:
@@ -417,7 +435,9 @@ def run_task(task: tuple[str, str, int], settings: Settings) -> tuple[list[Row],
     rows, shown = [], {}
     for run, model in zip(runs, models, strict=True):
         outputs = [represent(name, model, observations) for observations in run.normalise(preset)]
-        scores, predicted = probe([latent for latent, _ in outputs], run, 0 if name == "VAE" else 1)
+        scores, predicted = probe(
+            [latent for latent, _ in outputs], run, 0 if name == "VAE" else 1, settings.r2
+        )
         rows.append(
             {
                 "preset": preset,
@@ -442,11 +462,10 @@ def oracles(seed: int, settings: Settings) -> list[Row]:
         train, test = (data["observation"].double() for data in (run.train, run.test))
         filtered = KalmanFilter(run.system, run.noise_scale).filter(test)["next_signal_mean"][:-1]
         target = run.test["signal"][1:].double()
-        error = (filtered - target).square().sum() / (target - target.mean(0)).square().sum()
         scores = {
-            "Kalman filter": {"signal_r2": 1 - error.item(), "noise_r2": None},
-            "least squares": {**probe([train, test], run, 1)[0], "noise_r2": None},
-            "CCA": probe(cca(train, test, settings.sizes[0]), run, 1)[0],
+            "Kalman filter": {"signal_r2": r2_score(target, filtered, settings.r2), "noise_r2": None},
+            "least squares": {**probe([train, test], run, 1, settings.r2)[0], "noise_r2": None},
+            "CCA": probe(cca(train, test, settings.sizes[0]), run, 1, settings.r2)[0],
         }
         for name, values in scores.items():
             rows.append({"model": name, "noise_scale": run.noise_scale, "seed": seed, **values})
@@ -542,6 +561,7 @@ def figure_scores(preset: str, rows: Sequence[Row], path: Path) -> None:
 def figure_signals(preset: str, shown: dict[Any, Any], runs: Sequence[Run], path: Path) -> None:
     """The signal that the probe reads off each representation, and the predictive variances."""
     names = [name for name in MODELS if any(key[:2] == (preset, name) for key in shown)]
+    uncertain = any(shown[preset, name, runs[0].noise_scale][1] is not None for name in names)
     fig, axes = plt.subplots(
         2, len(runs), figsize=(4.5 * len(runs), 6), squeeze=False, sharey="row", layout="constrained"
     )
@@ -564,6 +584,8 @@ def figure_signals(preset: str, shown: dict[Any, Any], runs: Sequence[Run], path
         below.set(xlabel="latent dimension, most uncertain first", yscale="log", xticks=range(latent_dim))
     axes[0, 0].set_ylabel("first component of the signal, test")
     axes[1, 0].set_ylabel("predictive variance / variance of the mean")
+    for below in axes[1]:
+        below.set_visible(uncertain)
     handles = axes[0, 0].get_legend_handles_labels()
     fig.suptitle(f"Preset {preset}: the signal that a linear probe reads, and what the model is sure of")
     fig.legend(*handles, loc="outside lower center", ncols=len(names) + 1, frameon=False)

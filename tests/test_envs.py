@@ -87,14 +87,13 @@ class TestObjective:
             torch.testing.assert_close(env.objective(state, actions), total)
 
     def test_mode_and_mean_differ_where_they_should(self) -> None:
-        class Skewed(type(gaussian(torch.zeros(2), torch.zeros(2)))):  # an Independent Normal
+        class Skewed(Independent):
             @property
             def mode(self) -> Tensor:
                 return self.mean + 1
 
         def skewed(latent: Tensor, action: Tensor) -> Distribution:
-            base = gaussian(latent, action).base_dist
-            return Skewed(base, 1, validate_args=False)
+            return Skewed(gaussian(latent, action).base_dist, 1, validate_args=False)
 
         zero = torch.zeros(1, 1, 2)
         cost = quadratic_cost(torch.zeros(2))

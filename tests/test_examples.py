@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from sklearn.metrics import r2_score
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
@@ -341,6 +342,17 @@ def test_the_trajectory_is_the_papers(table: Any) -> None:
     torch.testing.assert_close(
         loud.train["observation"] - quiet.train["observation"], shift, atol=1e-4, rtol=0
     )
+
+
+@pytest.mark.parametrize(
+    ("average", "name"), [("uniform", "uniform_average"), ("weighted", "variance_weighted")]
+)
+def test_r2_is_that_of_scikit_learn(table: Any, average: str, name: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.randn(50, 3, generator=generator) * torch.tensor([1.0, 2.0, 5.0])
+    prediction = target + torch.randn(50, 3, generator=generator)
+    expected = r2_score(target.numpy(), prediction.numpy(), multioutput=name)
+    assert table.r2_score(target, prediction, average) == pytest.approx(expected, abs=1e-6)
 
 
 def test_cca_finds_the_signal_without_labels(table: Any) -> None:
