@@ -466,3 +466,8 @@ class TestTorchRLPlanners:
             top_k=20,
         )
         torch.testing.assert_close(mppi(td.clone())["action"], expected, atol=0.05, rtol=0)
+
+
+def test_a_reward_network_without_keys_is_refused() -> None:
+    with pytest.raises(TypeError, match="reward_model must be a TensorDictModule.*got QuadraticReward"):
+        make_env(reward_model=QuadraticReward(2, 2))

@@ -249,7 +249,7 @@ def test_bad_windows_are_refused() -> None:
         value[1, 2] = math.nan
         name = key if isinstance(key, str) else key[-1]
         refused(f"{name}.* must be finite", **{name: value})
-    refused("longer than the largest skip 6, got T=6", num_steps=7)
+    refused("num_steps=7 needs windows of at least 7 steps, got T=6", num_steps=7)
     refused("must be floating point", observation=torch.zeros(4, 6, OBS, dtype=torch.uint8))
     refused("'observation' must have shape", observation=torch.zeros(4, 6, OBS + 1).double())
     refused("action must have shape", action=torch.zeros(4, 6, ACTION + 1).double())
@@ -293,6 +293,13 @@ def test_flags_of_the_wrong_shape_are_refused() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RewardLoss(make_model(), make_head(), **arguments)
+
+
+def test_parts_of_the_wrong_kind_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"reward_model must be a TensorDictModule.*got QuadraticReward"):
+        RewardLoss(make_model(), QuadraticReward(LATENT, ACTION))
+    with pytest.raises(TypeError, match="model must be one LatentModel .*got list"):
+        RewardLoss([make_model()], make_head())
 
 
 def test_padded_images() -> None:

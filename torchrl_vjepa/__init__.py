@@ -16,8 +16,16 @@ from torchrl_vjepa.noisy_tv import (
     LQGController,
     NoisyTVEnv,
 )
-from torchrl_vjepa.objectives import BJEPALoss, CollapseWarning, JEPALoss, RewardLoss, VJEPALoss, WindowLoss
-from torchrl_vjepa.planners import CEM, MPPI, Planner, RandomShooting
+from torchrl_vjepa.objectives import (
+    BJEPALoss,
+    CollapseWarning,
+    JEPALoss,
+    LatentPredictionLoss,
+    RewardLoss,
+    VJEPALoss,
+    WindowLoss,
+)
+from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
@@ -33,6 +41,7 @@ __all__ = [
     "Delta",
     "DeltaHead",
     "DiagGaussianHead",
+    "EnvObjective",
     "FusedPredictor",
     "GaussianPrior",
     "Head",
@@ -42,6 +51,7 @@ __all__ = [
     "LQGController",
     "LatentEnv",
     "LatentModel",
+    "LatentPredictionLoss",
     "LinearGaussianSystem",
     "LinearProbe",
     "MPPI",
@@ -51,6 +61,7 @@ __all__ = [
     "PixelDecoder",
     "Planner",
     "Predictor",
+    "Proposal",
     "QuadraticReward",
     "RandomShooting",
     "RewardLoss",

@@ -331,6 +331,12 @@ class _LatentStep(TensorDictModuleBase):
         self.out_keys = [self.latent_key, self.reward_key]
         self.reward_calls_tensors = False
         if reward_model is not None:
+            if not isinstance(reward_model, TensorDictModuleBase):
+                raise TypeError(
+                    "reward_model must be a TensorDictModule, for instance TensorDictModule("
+                    "QuadraticReward(D, A), ['latent', 'action'], ['reward']), got "
+                    f"{type(reward_model).__name__}"
+                )
             reads = [unravel_key(key) for key in reward_model.in_keys]
             if not set(reads) <= set(self.in_keys):
                 raise KeyError(

@@ -25,7 +25,8 @@ class RewardLoss(WindowLoss):
     The head is asked what the planner will ask it: the reward of :math:`(\hat Z_{t+k}, u_{t+k-1})`
     where :math:`\hat Z_{t+k}` is the latent rolled out from :math:`Z_t` by the model's mean for
     :math:`k = 1, \dots,` ``num_steps`` (``eq:latent_mpc_objective`` with :math:`c = -r`). Rollouts that
-    leave an episode or meet padding do not count.
+    leave an episode or meet padding do not count. Train it after the representation, or beside it with
+    an optimizer of its own: rewards are not normalised, so the head often wants a larger learning rate.
 
     Entries: ``loss_reward``; diagnostic ``reward_error`` (mean absolute error).
 
@@ -33,11 +34,13 @@ class RewardLoss(WindowLoss):
         model: the trained (or training) model; parameters stay its own.
         reward_model: TensorDictModule that reads the next latent and the action and writes the reward.
         num_steps: length of the imagined rollouts.
-        train_model: whether the gradient flows into encoder and predictor too.
+        train_model: whether the gradient flows into encoder and predictor too; then ``parameters()``
+            holds theirs as well: give each to one optimizer only.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (``(B, T)``, zero where no rollout starts).
 
     Raises:
         ValueError: if ``num_steps`` is not positive or ``reduction`` is unknown.
+        TypeError: if ``model`` is no :class:`LatentModel` or ``reward_model`` no TensorDictModule.
 
     Examples:
         >>> import torch
@@ -97,6 +100,17 @@ class RewardLoss(WindowLoss):
     ) -> None:
         if num_steps < 1:
             raise ValueError(f"num_steps must be positive, got {num_steps}")
+        if not isinstance(model, LatentModel):
+            raise TypeError(
+                f"model must be one LatentModel (a list of losses trains a list of models), got "
+                f"{type(model).__name__}"
+            )
+        if not isinstance(reward_model, TensorDictModuleBase):
+            raise TypeError(
+                "reward_model must be a TensorDictModule, for instance TensorDictModule("
+                "QuadraticReward(D, A), ['latent', 'action'], ['reward']), got "
+                f"{type(reward_model).__name__}"
+            )
         parts = SimpleNamespace(reward_model=reward_model, encoder=model.encoder, predictor=model.predictor)
         names = ["reward_model", *(["encoder", "predictor"] if train_model else [])]
         super().__init__(
@@ -124,6 +138,15 @@ class RewardLoss(WindowLoss):
 
     def _optional_keys(self) -> list[NestedKey]:
         return super()._optional_keys() if "encoder" in self.__dict__ else []
+
+    def _batch_shape(self, tensordict: TensorDictBase) -> torch.Size:
+        batch = super()._batch_shape(tensordict)
+        if batch and batch[-1] < self.num_steps:
+            raise ValueError(
+                f"num_steps={self.num_steps} needs windows of at least {self.num_steps} steps, got "
+                f"T={batch[-1]}; sample longer slices (slice_len)"
+            )
+        return batch
 
     def _loss_keys(self) -> Iterator[str]:
         yield "loss_reward"
