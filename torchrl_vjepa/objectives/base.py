@@ -93,6 +93,8 @@ class LatentPredictionLoss(WindowLoss):
         {"variance_coeff", "covariance_coeff", "marginal_entropy_coeff", "sliced_entropy_coeff"}
     )
     _model_type = JEPA
+    #: Parts of the model whose parameters the loss takes: their name here, their attribute there.
+    _parts: dict[str, str] = {"encoder": "encoder", "predictor": "predictor"}
     #: The effective rank is compared with ``collapse_rank`` in every so many calls: it makes a GPU wait.
     collapse_interval: int = 20
 
@@ -100,7 +102,6 @@ class LatentPredictionLoss(WindowLoss):
         self,
         model: JEPA | Sequence[JEPA],
         *,
-        modules: dict[str, str] | None = None,
         skip_weights: Sequence[float] | None = None,
         stacked_data: bool = False,
         variance_coeff: float = 0.0,
@@ -114,7 +115,7 @@ class LatentPredictionLoss(WindowLoss):
         models = self._checked(model)
         super().__init__(
             model,
-            {"encoder": "encoder", "predictor": "predictor", **(modules or {})},
+            self._parts,
             targets=("encoder",),
             skips=models[0].predictor.skips,
             skip_weights=skip_weights,

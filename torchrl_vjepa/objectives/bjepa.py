@@ -57,11 +57,12 @@ class BJEPALoss(VJEPALoss):
 
     _schedulable_buffers = frozenset({"structural_kl_coeff"})
     _model_type = BJEPA
+    _parts = {**VJEPALoss._parts, "prior": "structural_prior_module"}
 
     def __init__(
         self, model: BJEPA | Sequence[BJEPA], *, structural_kl_coeff: float = 0.1, **kwargs: Any
     ) -> None:
-        super().__init__(model, modules={"prior": "structural_prior_module"}, **kwargs)
+        super().__init__(model, **kwargs)
         self._register_coeff("structural_kl_coeff", structural_kl_coeff)
 
     def _loss_keys(self) -> Iterator[str]:

@@ -102,7 +102,7 @@ class RewardLoss(WindowLoss):
             raise ValueError(f"num_steps must be positive, got {num_steps}")
         if not isinstance(model, LatentModel):
             raise TypeError(
-                f"model must be one LatentModel (a list of losses trains a list of models), got "
+                f"model must be one LatentModel (of several, give each a RewardLoss of its own), got "
                 f"{type(model).__name__}"
             )
         if not isinstance(reward_model, TensorDictModuleBase):
@@ -162,7 +162,6 @@ class RewardLoss(WindowLoss):
             starts = latent[:, : latent.shape[1] - steps + 1]
             if chunks is None:
                 chunks = starts.new_zeros(*starts.shape[:-1], steps, 0)
-                return rollout(lambda z, _: self.predictor.dist(z), starts, chunks)
             return rollout(self.predictor.dist, starts, chunks)
 
     def _terms(

@@ -95,12 +95,13 @@ class VJEPALoss(LatentPredictionLoss):
 
     _schedulable_buffers = frozenset({"target_kl_coeff"})
     _model_type = VJEPA
+    # Not named target_scale: SoftUpdate would take it for the target of "scale".
+    _parts = {**LatentPredictionLoss._parts, "scale": "target_scale"}
 
     def __init__(
         self,
         model: VJEPA | Sequence[VJEPA],
         *,
-        modules: dict[str, str] | None = None,
         skip_weights: Sequence[float] | None = None,
         stacked_data: bool = False,
         target_kl_coeff: float = 0.01,
@@ -122,8 +123,6 @@ class VJEPALoss(LatentPredictionLoss):
             raise ValueError(f"residual_variance must be 'head' or 'batch', got {residual_variance!r}")
         super().__init__(
             model,
-            # Not named target_scale: SoftUpdate would take it for the target of "scale".
-            modules={"scale": "target_scale", **(modules or {})},
             skip_weights=skip_weights,
             stacked_data=stacked_data,
             variance_coeff=variance_coeff,
