@@ -114,11 +114,11 @@ class Settings:
 
 QUICK = {
     "noise_scales": [0.0, 8.0],
-    "frames": 8_000,
+    "frames": 4_000,
     "restarts": 2,
-    "train_steps": 250,
+    "train_steps": 150,
     "episodes": 4,
-    "optim_steps": 3,
+    "optim_steps": 2,
 }
 
 
