@@ -149,10 +149,10 @@ def measure(size: str, rounds: int, steps: int) -> dict[str, float | str]:
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, step in contenders.items():
-            start = time.perf_counter()
+            start = time.process_time()
             for _ in range(steps):
                 step()
-            times[name].append((time.perf_counter() - start) / steps * 1000)
+            times[name].append((time.process_time() - start) / steps * 1000)
     medians = {name: statistics.median(values) for name, values in times.items()}
     ratios = [a / b for a, b in zip(times["library"], times["bare"], strict=True)]
     return {

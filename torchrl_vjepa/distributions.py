@@ -6,6 +6,7 @@ event shape ``(D,)``; the functions here read it in the ways the paper names (me
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Literal
@@ -18,6 +19,7 @@ from torch.distributions import (
     MultivariateNormal,
     Normal,
     constraints,
+    register_kl,
 )
 from torchrl.modules import Delta as _TorchRLDelta
 
@@ -81,7 +83,7 @@ class Delta(_TorchRLDelta):
         return type(self)(self.param.expand(*batch_shape, *self.event_shape))
 
 
-def diag_gaussian(loc: Tensor, scale: Tensor) -> Independent:
+def diag_gaussian(loc: Tensor, scale: Tensor | None = None, *, log_var: Tensor | None = None) -> Independent:
     r"""Diagonal Gaussian :math:`\mathcal N(\mu, \mathrm{diag}(\sigma^2))` over the last dimension.
 
     Arguments are not validated: the check reads values, which stalls a GPU and breaks ``vmap``.
@@ -89,35 +91,116 @@ def diag_gaussian(loc: Tensor, scale: Tensor) -> Independent:
     Args:
         loc: mean, of shape ``(*B, D)``.
         scale: standard deviation, positive, broadcastable to ``(*B, D)``.
+        log_var: :math:`\log \sigma^2` instead of ``scale``; what a network gives, and the likelihood then
+            needs neither a root nor a logarithm.
 
     Returns:
         A distribution with batch ``*B`` and event ``(D,)``.
+
+    Raises:
+        ValueError: if not exactly one of ``scale`` and ``log_var`` is given.
 
     Examples:
         >>> import torch
         >>> diag_gaussian(torch.zeros(5, 3), torch.ones(3)).event_shape
         torch.Size([3])
+        >>> diag_gaussian(torch.zeros(5, 3), log_var=torch.zeros(3)).variance[0]
+        tensor([1., 1., 1.])
     """
+    spread = log_var if scale is None else scale
+    if spread is None or (scale is not None and log_var is not None):
+        raise ValueError(
+            "exactly one of scale and log_var must be given, got "
+            f"{'neither' if spread is None else 'both'}"
+        )
     # Under autocast a learned scale keeps its dtype, and torch.normal refuses two.
-    dtype = torch.promote_types(loc.dtype, scale.dtype)
-    return _DiagGaussian(loc.to(dtype), scale.to(dtype))
+    dtype = torch.promote_types(loc.dtype, spread.dtype)
+    return _DiagGaussian(loc.to(dtype), spread.to(dtype), is_log_var=scale is None)
 
 
 class _DiagGaussian(Independent):
-    """``Independent(Normal)`` that keeps a scale shared by the batch small: one logarithm, not B."""
+    """``Independent(Normal)`` that computes what is asked for, and keeps a spread that the batch shares small."""
 
-    def __init__(self, loc: Tensor, scale: Tensor) -> None:
-        self._scale = scale.expand(*scale.shape[:-1], loc.shape[-1])
-        loc, scale = torch.broadcast_tensors(loc, scale)
-        super().__init__(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+    def __init__(self, loc: Tensor, spread: Tensor, *, is_log_var: bool) -> None:
+        # Not Independent's constructor: a training step needs no base distribution.
+        size = loc.shape[-1]
+        batch = torch.broadcast_shapes(loc.shape[:-1], spread.shape[:-1])
+        self.loc = loc.expand(*batch, size)
+        self._spread = spread.expand(*spread.shape[:-1], size)
+        self._is_log_var = is_log_var
+        self.reinterpreted_batch_ndims = 1
+        Distribution.__init__(self, batch, self.loc.shape[-1:], validate_args=False)
+
+    @functools.cached_property
+    def base_dist(self) -> Normal:
+        loc, scale = torch.broadcast_tensors(self.loc, self.scale)
+        return Normal(loc, scale, validate_args=False)
+
+    @property
+    def scale(self) -> Tensor:
+        """Standard deviation, broadcastable to the mean."""
+        return (0.5 * self._spread).exp() if self._is_log_var else self._spread
+
+    @property
+    def log_var(self) -> Tensor:
+        """Logarithm of the variance, broadcastable to the mean."""
+        return self._spread if self._is_log_var else 2 * self._spread.log()
+
+    @property
+    def precision(self) -> Tensor:
+        """Inverse variance, broadcastable to the mean."""
+        return (-self._spread).exp() if self._is_log_var else self._spread.pow(-2)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.loc
+
+    @property
+    def mode(self) -> Tensor:
+        return self.loc
+
+    @property
+    def variance(self) -> Tensor:
+        variance = self._spread.exp() if self._is_log_var else self._spread.square()
+        return variance.expand_as(self.loc)
+
+    @property
+    def stddev(self) -> Tensor:
+        return self.scale.expand_as(self.loc)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        normed = (value - self.base_dist.loc) / self._scale
-        constant = self._scale.log().sum(-1) + 0.5 * value.shape[-1] * math.log(2 * math.pi)
-        return -0.5 * normed.square().sum(-1) - constant
+        deviation = value - self.loc
+        constant = 0.5 * value.shape[-1] * math.log(2 * math.pi)
+        if self._spread.ndim == 1:
+            # Shared by the batch: one product with a vector, and one constant.
+            quadratic = deviation.square() @ self.precision
+            return -0.5 * quadratic - (constant + 0.5 * self.log_var.sum(-1))
+        terms = torch.addcmul(self.log_var, deviation.square(), self.precision)
+        return -0.5 * terms.sum(-1) - constant
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        shape = (*sample_shape, *self.loc.shape)
+        noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
+        return torch.addcmul(self.loc, self.scale, noise)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        with torch.no_grad():
+            return self.rsample(sample_shape)
+
+    def entropy(self) -> Tensor:
+        constant = 0.5 * self.loc.shape[-1] * (1 + math.log(2 * math.pi))
+        return (constant + 0.5 * self.log_var.sum(-1)).expand(self.batch_shape)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> _DiagGaussian:
-        return _DiagGaussian(self.base_dist.loc.expand(*batch_shape, *self.event_shape), self._scale)
+        loc = self.loc.expand(*batch_shape, *self.event_shape)
+        return _DiagGaussian(loc, self._spread, is_log_var=self._is_log_var)
+
+
+@register_kl(_DiagGaussian, _DiagGaussian)
+def _kl_diagonal(p: _DiagGaussian, q: _DiagGaussian) -> Tensor:
+    log_ratio = p.log_var - q.log_var
+    mahalanobis = (p.loc - q.loc).square() * q.precision
+    return 0.5 * (log_ratio.exp() - 1 - log_ratio + mahalanobis).sum(-1)
 
 
 def sample(

@@ -36,6 +36,12 @@ class _ObservationNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         dtype = next(self.network.parameters()).dtype
         check_observation(observation, self.observation_dim, self.key, dtype)
+        # Rows: a matrix stays one product when several models are mapped over.
+        rows = observation.flatten(0, -2) if observation.ndim > 2 else observation
+        latent = self._encode(rows)
+        return latent.unflatten(0, observation.shape[:-1]) if observation.ndim > 2 else latent
+
+    def _encode(self, observation: Tensor) -> Tensor:
         if self.whitening is None:
             return self.network(observation)
         if isinstance(self.network, nn.Linear):

@@ -11,6 +11,7 @@ import math
 from typing import Literal, get_args
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributions import Independent
 
@@ -40,10 +41,12 @@ def soft_clamp(value: Tensor, low: float, high: float) -> Tensor:
         tensor([-10.0000,   1.5000,  10.0000])
     """
     margin = min(1.0, (high - low) / 4)
-    inside = value.clamp(low + margin, high - margin)
-    excess = value - inside
-    # Not m e / (m + |e|): infinity over infinity.
-    return inside + excess.sign() * (margin - margin**2 / (margin + excess.abs()))
+    middle, half = 0.5 * (low + high), 0.5 * (high - low) - margin
+    # Each line is one fused pass; what lies beyond the margin is zero almost everywhere.
+    inside = F.hardtanh(value, low + margin, high - margin)
+    excess = F.softshrink(value - middle if middle else value, half)
+    excess = F.hardtanh(excess, -1e6, 1e6)  # infinity over infinity
+    return inside + excess / (1 + excess.abs() / margin)
 
 
 class Head(nn.Module):
@@ -114,7 +117,8 @@ class DiagGaussianHead(Head):
         scale: ``"state"``: :math:`\log \sigma^2_\phi(Z_C)` is a second output of the trunk, as in the
             paper; ``"constant"``: one learned log-variance per skip and dimension, which is exact for
             linear-Gaussian systems.
-        log_var_range: ``(low, high)`` of the log-variance, in nats.
+        log_var_range: ``(low, high)`` of the log-variance, in nats; ``None`` leaves it unbounded, as the
+            paper prints it.
 
     Raises:
         ValueError: if ``scale`` is unknown or the range is empty or infinite.
@@ -131,7 +135,7 @@ class DiagGaussianHead(Head):
         self,
         scale: Literal["state", "constant"] = "state",
         *,
-        log_var_range: tuple[float, float] = (-16.0, 16.0),
+        log_var_range: tuple[float, float] | None = (-16.0, 16.0),
     ) -> None:
         super().__init__()
         if scale not in ("state", "constant"):
@@ -175,10 +179,16 @@ class DiagGaussianHead(Head):
             loc, log_var = features.chunk(2, dim=-1)
         else:
             loc, log_var = features, constants
-        return diag_gaussian(loc, (0.5 * soft_clamp(log_var, *self.log_var_range)).exp())
+        return diag_gaussian(loc, log_var=_bounded(log_var, self.log_var_range))
 
 
-def _checked_range(log_var_range: tuple[float, float]) -> tuple[float, float]:
+def _bounded(log_var: Tensor, log_var_range: tuple[float, float] | None) -> Tensor:
+    return log_var if log_var_range is None else soft_clamp(log_var, *log_var_range)
+
+
+def _checked_range(log_var_range: tuple[float, float] | None) -> tuple[float, float] | None:
+    if log_var_range is None:
+        return None
     low, high = (float(bound) for bound in log_var_range)
     if not -math.inf < low < high < math.inf:
         raise ValueError(f"log_var_range must be finite (low, high) with low < high, got {log_var_range}")
@@ -197,7 +207,7 @@ class TargetScale(nn.Module):
         kind: ``"linear"``: :math:`\log\sigma^2 = W x`, the second linear head of the paper's target
             encoder; ``"learned"``: one learned log-variance per dimension; ``"constant"``: fixed.
         init_std: standard deviation at the start (``"learned"``, ``"constant"``), in units of the latent.
-        log_var_range: the log-variance is softly clamped to it, in nats.
+        log_var_range: the log-variance is softly clamped to it, in nats; ``None`` leaves it unbounded.
 
     Raises:
         ValueError: if sizes are not positive, ``init_std`` is outside of the range, or ``kind`` is unknown.
@@ -215,7 +225,7 @@ class TargetScale(nn.Module):
         *,
         kind: TargetScaleKind = "learned",
         init_std: float = 1.0,
-        log_var_range: tuple[float, float] = (-16.0, 16.0),
+        log_var_range: tuple[float, float] | None = (-16.0, 16.0),
     ) -> None:
         super().__init__()
         if kind not in get_args(TargetScaleKind):
@@ -229,7 +239,8 @@ class TargetScale(nn.Module):
         self.latent_dim = latent_dim
         self.kind = kind
         self.init_std = float(init_std)
-        low, high = self.log_var_range = _checked_range(log_var_range)
+        self.log_var_range = _checked_range(log_var_range)
+        low, high = self.log_var_range or (-math.inf, math.inf)
         if kind != "linear" and not low <= 2.0 * math.log(self.init_std) <= high:
             raise ValueError(
                 f"init_std must have a log-variance in log_var_range={log_var_range}, got "
@@ -250,6 +261,18 @@ class TargetScale(nn.Module):
             with torch.no_grad():
                 self.log_var.fill_(2.0 * math.log(self.init_std))
 
+    def log_variance(self, observation: Tensor) -> Tensor:
+        r"""Log-variance :math:`\log \sigma^2_{\theta'}` of the target.
+
+        Args:
+            observation: target observation, of shape ``(*B, O)``.
+
+        Returns:
+            Of shape ``(*B, D)``; ``(D,)`` where it does not depend on the observation.
+        """
+        log_var = self.linear(observation) if self.kind == "linear" else self.log_var
+        return _bounded(log_var, self.log_var_range)
+
     def forward(self, observation: Tensor) -> Tensor:
         """Standard deviation of the target.
 
@@ -260,5 +283,4 @@ class TargetScale(nn.Module):
             Standard deviations of shape ``(*B, D)``; ``(D,)`` where they do not depend on the
             observation.
         """
-        log_var = self.linear(observation) if self.kind == "linear" else self.log_var
-        return (0.5 * soft_clamp(log_var, *self.log_var_range)).exp()
+        return (0.5 * self.log_variance(observation)).exp()

@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_vjepa.objectives.pairs import mean_over
 from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
 
 __all__ = ["WindowLoss"]
@@ -203,10 +204,14 @@ class WindowLoss(LossModule):
         """The parameters that ``_terms`` takes, stacked if there are several models."""
         return tuple(getattr(self, f"{name}_params") for name in self._modules_of_model)
 
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
+        """What the modules of one model make of windows ``(B, T)``; mapped over the models."""
+        raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
+
     def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """The ``loss_*`` entries and diagnostics of one model on windows ``(B, T)``."""
+        """The ``loss_*`` entries and diagnostics, from the outputs of all models at once."""
         raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
 
     # The computation
@@ -256,14 +261,15 @@ class WindowLoss(LossModule):
         data, masks = self._read(tensordict)
         params = self._params()
         if self.num_models is None:
-            terms = self._terms(data, masks, *params)
+            outputs = self._networks(data, *params)
         else:
-            in_dim = 0 if self.stacked_data else None
-            terms = torch.vmap(
-                self._terms,
-                in_dims=(in_dim, in_dim, *[0] * len(params)),
+            # Only what depends on modules is mapped: the rest is arithmetic on larger tensors.
+            outputs = torch.vmap(
+                self._networks,
+                in_dims=(0 if self.stacked_data else None, *[0] * len(params)),
                 randomness=self._vmap_randomness,
-            )(data, masks, *params)
+            )(data, *params)
+        terms = self._terms(data, masks, outputs)
         terms = {key: terms[key] for key in self.out_keys}
         if self.reduction == "none":
             lead = () if self.num_models is None else (self.num_models,)
@@ -351,36 +357,48 @@ class WindowLoss(LossModule):
 
     def _encode(self, data: TensorDictBase, params: TensorDictBase, latent_key: NestedKey) -> Tensor:
         """Latents ``(B, T, D)``, in float32 under autocast."""
-        with params.to_module(self.encoder):
-            latent = self.encoder(data.copy()).get(latent_key)
+        encoder = self.encoder
+        with params.to_module(encoder):
+            if type(encoder) is TensorDictModule and encoder.out_keys == [latent_key]:
+                # A plain network needs no tensordict.
+                latent = encoder.module(*[data.get(key) for key in encoder.in_keys])
+            else:
+                latent = encoder(data.copy()).get(latent_key)
         return latent.float() if latent.dtype in (torch.float16, torch.bfloat16) else latent
 
     def _reduce(self, values: list[Tensor], masks: list[Tensor | None], length: int) -> Tensor:
         """Reduce one number for each pair (or step), over pairs and skips, as ``reduction`` says.
 
         Args:
-            values: for each skip ``(B, T - skip)``.
-            masks: those that count, or ``None`` for all.
+            values: for each skip ``(*N, B, T - skip)``.
+            masks: those that count, ``(B, T - skip)`` or ``(*N, B, T - skip)``, or ``None`` for all.
             length: ``T``.
 
         Returns:
-            A scalar, or ``(B, T)`` for ``"none"``, zero where nothing counts. Several entries are
+            ``(*N)``, or ``(*N, B, T)`` for ``"none"``, zero where nothing counts. Several entries are
             averaged with ``skip_weights``.
         """
         rows = []
-        weights = self.skip_weights if len(values) == len(self.skips) else (1.0,)
         for value, mask in zip(values, masks, strict=True):
-            if mask is not None:
-                value = torch.where(mask, value, 0)
             if self.reduction == "none":
-                rows.append(torch.nn.functional.pad(value, (0, length - value.shape[1])))
-            elif self.reduction == "sum" or mask is None:
-                rows.append(value.sum() if self.reduction == "sum" else value.mean())
-            else:
-                rows.append(value.sum() / mask.sum().clamp_min(1))
-        return sum(
-            (weight * row for weight, row in zip(weights[1:], rows[1:], strict=True)), weights[0] * rows[0]
-        )
+                kept = value if mask is None else torch.where(mask, value, 0)
+                rows.append(torch.nn.functional.pad(kept, (0, length - value.shape[-1])))
+                continue
+            mask = None if mask is None else mask.flatten(-2)
+            mean = mean_over(value.flatten(-2), mask)
+            rows.append(mean * self._count(value, mask) if self.reduction == "sum" else mean)
+        return self._over_skips(rows)
+
+    @staticmethod
+    def _count(value: Tensor, mask: Tensor | None) -> Tensor | int:
+        return value.shape[-1] * value.shape[-2] if mask is None else mask.sum(-1)
+
+    def _over_skips(self, values: list[Tensor]) -> Tensor:
+        """Mean over skips with ``skip_weights``; a single entry stays as it is."""
+        if len(values) == 1:
+            return values[0]
+        first, *rest = (w * value for w, value in zip(self.skip_weights, values, strict=True))
+        return sum(rest, first)
 
 
 def _normalised(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
