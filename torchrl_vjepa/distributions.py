@@ -6,12 +6,12 @@ event shape ``(D,)``; the functions here read it in the ways the paper names (me
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.distributions import (
     Distribution,
@@ -23,7 +23,7 @@ from torch.distributions import (
 )
 from torchrl.modules import Delta as _TorchRLDelta
 
-__all__ = ["Delta", "diag_gaussian", "point_estimate", "product_of_experts", "sample"]
+__all__ = ["Delta", "diag_gaussian", "point_estimate", "product_of_experts", "sample", "soft_clamp"]
 
 
 class Delta(_TorchRLDelta):
@@ -83,7 +83,42 @@ class Delta(_TorchRLDelta):
         return type(self)(self.param.expand(*batch_shape, *self.event_shape))
 
 
-def diag_gaussian(loc: Tensor, scale: Tensor | None = None, *, log_var: Tensor | None = None) -> Independent:
+def soft_clamp(value: Tensor, low: float, high: float) -> Tensor:
+    r"""Clamp with a gradient everywhere.
+
+    The identity up to a margin :math:`m` from the bounds (1, or a quarter of a narrow range); beyond it,
+    the excess :math:`e` becomes :math:`m e / (m + |e|)`, which approaches the bound. (Softplus would do
+    the same at several times the cost.)
+
+    Args:
+        value: any tensor.
+        low: lower bound, approached and never passed.
+        high: upper bound, approached and never passed.
+
+    Returns:
+        A tensor of the same shape with values in ``[low, high]``.
+
+    Examples:
+        >>> import torch
+        >>> soft_clamp(torch.tensor([-1000.0, 1.5, 1000.0]), -10.0, 10.0).round(decimals=2)
+        tensor([-10.0000,   1.5000,  10.0000])
+    """
+    margin = min(1.0, (high - low) / 4)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low) - margin
+    # Each line is one fused pass; what lies beyond the margin is zero almost everywhere.
+    inside = F.hardtanh(value, low + margin, high - margin)
+    excess = F.softshrink(value - middle if middle else value, half)
+    excess = F.hardtanh(excess, -1e6, 1e6)  # infinity over infinity
+    return inside + excess / (1 + excess.abs() / margin)
+
+
+def diag_gaussian(
+    loc: Tensor,
+    scale: Tensor | None = None,
+    *,
+    log_var: Tensor | None = None,
+    log_var_range: tuple[float, float] | None = None,
+) -> Independent:
     r"""Diagonal Gaussian :math:`\mathcal N(\mu, \mathrm{diag}(\sigma^2))` over the last dimension.
 
     Arguments are not validated: the check reads values, which stalls a GPU and breaks ``vmap``.
@@ -93,6 +128,7 @@ def diag_gaussian(loc: Tensor, scale: Tensor | None = None, *, log_var: Tensor |
         scale: standard deviation, positive, broadcastable to ``(*B, D)``.
         log_var: :math:`\log \sigma^2` instead of ``scale``; what a network gives, and the likelihood then
             needs neither a root nor a logarithm.
+        log_var_range: ``log_var`` is softly clamped to it (:func:`soft_clamp`), once it is needed.
 
     Returns:
         A distribution with batch ``*B`` and event ``(D,)``.
@@ -115,23 +151,41 @@ def diag_gaussian(loc: Tensor, scale: Tensor | None = None, *, log_var: Tensor |
         )
     # Under autocast a learned scale keeps its dtype, and torch.normal refuses two.
     dtype = torch.promote_types(loc.dtype, spread.dtype)
-    return _DiagGaussian(loc.to(dtype), spread.to(dtype), is_log_var=scale is None)
+    return _DiagGaussian(loc.to(dtype), spread.to(dtype), scale is None, log_var_range)
 
 
 class _DiagGaussian(Independent):
     """``Independent(Normal)`` that computes what is asked for, and keeps a spread that the batch shares small."""
 
-    def __init__(self, loc: Tensor, spread: Tensor, *, is_log_var: bool) -> None:
+    def __init__(
+        self,
+        loc: Tensor,
+        spread: Tensor,
+        is_log_var: bool,
+        log_var_range: tuple[float, float] | None = None,
+    ) -> None:
         # Not Independent's constructor: a training step needs no base distribution.
         size = loc.shape[-1]
-        batch = torch.broadcast_shapes(loc.shape[:-1], spread.shape[:-1])
-        self.loc = loc.expand(*batch, size)
-        self._spread = spread.expand(*spread.shape[:-1], size)
-        self._is_log_var = is_log_var
+        batch = loc.shape[:-1]
+        if spread.ndim > 1 and spread.shape[:-1] != batch:
+            batch = torch.broadcast_shapes(batch, spread.shape[:-1])
+            loc = loc.expand(*batch, size)
+        if spread.shape[-1:] != (size,):
+            spread = spread.expand(*spread.shape[:-1], size)
+        self.loc = loc
+        self._given = spread
+        self._is_log_var, self._log_var_range = is_log_var, log_var_range
         self.reinterpreted_batch_ndims = 1
-        Distribution.__init__(self, batch, self.loc.shape[-1:], validate_args=False)
+        Distribution.__init__(self, batch, loc.shape[-1:], validate_args=False)
 
-    @functools.cached_property
+    @property
+    def _spread(self) -> Tensor:
+        """Scale or bounded log-variance: a loss that needs the mean alone does not pay for it."""
+        if self._log_var_range is not None:
+            self._given, self._log_var_range = soft_clamp(self._given, *self._log_var_range), None
+        return self._given
+
+    @property
     def base_dist(self) -> Normal:
         loc, scale = torch.broadcast_tensors(self.loc, self.scale)
         return Normal(loc, scale, validate_args=False)
@@ -171,9 +225,12 @@ class _DiagGaussian(Independent):
     def log_prob(self, value: Tensor) -> Tensor:
         deviation = value - self.loc
         constant = 0.5 * value.shape[-1] * math.log(2 * math.pi)
-        if self._spread.ndim == 1:
-            # Shared by the batch: one product with a vector, and one constant.
-            quadratic = deviation.square() @ self.precision
+        if self._given.ndim == 1 or (self._given.shape[-2] == 1 and deviation.ndim > 1):
+            # Shared by the rows: one product with a vector, and one constant.
+            precision = self.precision
+            weights = precision if precision.ndim == 1 else precision.mT
+            quadratic = deviation.square() @ weights
+            quadratic = quadratic if precision.ndim == 1 else quadratic.squeeze(-1)
             return -0.5 * quadratic - (constant + 0.5 * self.log_var.sum(-1))
         terms = torch.addcmul(self.log_var, deviation.square(), self.precision)
         return -0.5 * terms.sum(-1) - constant
@@ -193,7 +250,7 @@ class _DiagGaussian(Independent):
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> _DiagGaussian:
         loc = self.loc.expand(*batch_shape, *self.event_shape)
-        return _DiagGaussian(loc, self._spread, is_log_var=self._is_log_var)
+        return _DiagGaussian(loc, self._given, self._is_log_var, self._log_var_range)
 
 
 @register_kl(_DiagGaussian, _DiagGaussian)

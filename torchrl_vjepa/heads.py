@@ -11,42 +11,13 @@ import math
 from typing import Literal, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.distributions import Independent
 
-from torchrl_vjepa.distributions import Delta, diag_gaussian
+from torchrl_vjepa.distributions import Delta, diag_gaussian, soft_clamp
+from torchrl_vjepa.stacking import linear
 
 __all__ = ["DeltaHead", "DiagGaussianHead", "Head", "TargetScale", "soft_clamp"]
-
-
-def soft_clamp(value: Tensor, low: float, high: float) -> Tensor:
-    r"""Clamp with a gradient everywhere.
-
-    The identity up to a margin :math:`m` from the bounds (1, or a quarter of a narrow range); beyond it,
-    the excess :math:`e` becomes :math:`m e / (m + |e|)`, which approaches the bound. (Softplus would do
-    the same at several times the cost.)
-
-    Args:
-        value: any tensor.
-        low: lower bound, approached and never passed.
-        high: upper bound, approached and never passed.
-
-    Returns:
-        A tensor of the same shape with values in ``[low, high]``.
-
-    Examples:
-        >>> import torch
-        >>> soft_clamp(torch.tensor([-1000.0, 1.5, 1000.0]), -10.0, 10.0).round(decimals=2)
-        tensor([-10.0000,   1.5000,  10.0000])
-    """
-    margin = min(1.0, (high - low) / 4)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low) - margin
-    # Each line is one fused pass; what lies beyond the margin is zero almost everywhere.
-    inside = F.hardtanh(value, low + margin, high - margin)
-    excess = F.softshrink(value - middle if middle else value, half)
-    excess = F.hardtanh(excess, -1e6, 1e6)  # infinity over infinity
-    return inside + excess / (1 + excess.abs() / margin)
 
 
 class Head(nn.Module):
@@ -54,11 +25,16 @@ class Head(nn.Module):
 
     ``forward(features (*B, F), constants (C,)) -> Distribution`` with batch ``*B`` and event ``(D,)``,
     where ``F = num_features(D)`` and ``C = num_constants(D)``. The first ``D`` features are the mean.
+    A head that has no parameters and only broadcasts says so by ``stackable = True``: it is then called
+    with features ``(N, R, F)`` and constants ``(N, 1, C)`` of several models at once
+    (:func:`~torchrl_vjepa.stacking.linear`).
 
     Examples:
         >>> DeltaHead().num_features(4), DeltaHead().num_constants(4)
         (4, 0)
     """
+
+    stackable = False
 
     def num_features(self, latent_dim: int) -> int:
         """Number of state-dependent features for a latent of ``latent_dim``.
@@ -93,6 +69,8 @@ class DeltaHead(Head):
         >>> DeltaHead()(torch.ones(2, 3), torch.empty(0)).mean.shape
         torch.Size([2, 3])
     """
+
+    stackable = True
 
     def forward(self, features: Tensor, constants: Tensor) -> Delta:
         """Point mass on the features.
@@ -130,6 +108,8 @@ class DiagGaussianHead(Head):
         >>> p.batch_shape, p.event_shape, p.variance[0]
         (torch.Size([5]), torch.Size([3]), tensor([1., 1., 1.]))
     """
+
+    stackable = True
 
     def __init__(
         self,
@@ -179,11 +159,7 @@ class DiagGaussianHead(Head):
             loc, log_var = features.chunk(2, dim=-1)
         else:
             loc, log_var = features, constants
-        return diag_gaussian(loc, log_var=_bounded(log_var, self.log_var_range))
-
-
-def _bounded(log_var: Tensor, log_var_range: tuple[float, float] | None) -> Tensor:
-    return log_var if log_var_range is None else soft_clamp(log_var, *log_var_range)
+        return diag_gaussian(loc, log_var=log_var, log_var_range=self.log_var_range)
 
 
 def _checked_range(log_var_range: tuple[float, float] | None) -> tuple[float, float] | None:
@@ -217,6 +193,8 @@ class TargetScale(nn.Module):
         >>> TargetScale(3, kind="constant", init_std=0.5)(torch.zeros(2, 7))
         tensor([0.5000, 0.5000, 0.5000])
     """
+
+    stackable = True
 
     def __init__(
         self,
@@ -270,8 +248,11 @@ class TargetScale(nn.Module):
         Returns:
             Of shape ``(*B, D)``; ``(D,)`` where it does not depend on the observation.
         """
-        log_var = self.linear(observation) if self.kind == "linear" else self.log_var
-        return _bounded(log_var, self.log_var_range)
+        if self.kind == "linear":
+            log_var = linear(observation, self.linear.weight)
+        else:
+            log_var = self.log_var if self.log_var.ndim == 1 else self.log_var.unsqueeze(-2)
+        return log_var if self.log_var_range is None else soft_clamp(log_var, *self.log_var_range)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Standard deviation of the target.

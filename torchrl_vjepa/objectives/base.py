@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
 from torchrl_vjepa.models import JEPA
@@ -139,9 +139,16 @@ class LatentPredictionLoss(WindowLoss):
             self.register_buffer("sliced_entropy_coeff", None)
         else:
             self._register_coeff("sliced_entropy_coeff", sliced_entropy_coeff)
+        self._stackable = all(getattr(module, "stackable", False) for module in self._plain_modules())
         self.collapse_rank = float(collapse_rank)
         self._calls = 0
         self._warned = False
+
+    def _plain_modules(self) -> Iterator[torch.nn.Module]:
+        """The modules of the model without the TensorDictModules around them."""
+        for name in self._modules_of_model:
+            module = getattr(self, name)
+            yield module.module if type(module) is TensorDictModule else module
 
     def _required_keys(self) -> list[NestedKey]:
         return [self.encoder.in_keys[0], *self.predictor.in_keys[1:]]
@@ -196,11 +203,11 @@ class LatentPredictionLoss(WindowLoss):
         side_info = data.get(predictor.side_info_key) if predictor.side_info_dim else None
         with named["predictor"].to_module(predictor):
             for skip in predictor.skips:
-                context = latent[:, :-skip].flatten(0, 1)
-                chunks = None if action is None else action_chunks(action, skip).flatten(0, 1)
-                info = None if side_info is None else side_info[:, skip:].flatten(0, 1)
+                context = latent[..., :-skip, :].flatten(-3, -2)
+                chunks = None if action is None else _like(context, action_chunks(action, skip).flatten(-4, -3), 2)
+                info = None if side_info is None else _like(context, side_info[..., skip:, :].flatten(-3, -2), 1)
                 p = predictor.dist(context, chunks, skip=skip, side_info=info)
-                pairs = Pairs(skip, p, target[:, skip:].flatten(0, 1), context, chunks, info)
+                pairs = Pairs(skip, p, target[..., skip:, :].flatten(-3, -2), context, chunks, info)
                 with torch.autocast(latent.device.type, enabled=False):
                     of_pairs = self._pair_outputs(pairs, named)
                 outputs.update({f"{name}_{skip}": value for name, value in of_pairs.items()})
@@ -214,13 +221,20 @@ class LatentPredictionLoss(WindowLoss):
         mask = rows_of(masks.get("steps"))
         with torch.autocast(latent.device.type, enabled=False):
             terms = self._member_terms(outputs, masks)
-            mean, covariance = row_moments(rows, mask)
-            values = eigenvalues(covariance)
-            terms.update(self._regularisers(mean, covariance, values))
+            # Without a regulariser the moments are diagnostics: no gradient flows through them.
+            moved = any(map(self._is_active, ("variance_coeff", "covariance_coeff", "marginal_entropy_coeff")))
+            if moved or self._wants_diagnostics or self.reduction == "none":
+                with torch.set_grad_enabled(moved and torch.is_grad_enabled()):
+                    mean, covariance = row_moments(rows, mask)
+                    values = eigenvalues(covariance)
+                    terms.update(self._regularisers(mean, covariance, values))
+            else:
+                zero = latent.new_zeros(latent.shape[:-3])
+                terms |= {"loss_variance": zero, "loss_covariance": zero, "loss_entropy": zero}
             if self.sliced_entropy_coeff is not None:
                 distance = row_distance(rows, mask, num_slices=self.num_slices)
                 terms["loss_sliced"] = self.sliced_entropy_coeff * distance
-            if self.reduction != "none":
+            if self._wants_diagnostics:
                 terms["effective_rank"] = spectrum_rank(values.detach())
                 deviations = covariance.detach().diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
                 terms["latent_std"] = deviations.mean(-1)
@@ -233,6 +247,11 @@ class LatentPredictionLoss(WindowLoss):
                 if key.startswith("loss_")
             }
         return terms
+
+    def _is_active(self, coeff: str) -> bool:
+        """Whether a coefficient may be other than zero; only on a CPU looking costs nothing."""
+        value = getattr(self, coeff)
+        return torch.compiler.is_compiling() or value.device.type != "cpu" or bool(value != 0)
 
     def _pad_pairs(self, name: str, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> Tensor:
         """For ``reduction="none"``: the entries ``name`` of all skips as ``(*N, B, T)``."""
@@ -289,3 +308,8 @@ class LatentPredictionLoss(WindowLoss):
                 CollapseWarning,
                 stacklevel=3,
             )
+
+
+def _like(context: Tensor, value: Tensor, event_dims: int) -> Tensor:
+    """What all models share, ``(R, *event)``, with the dimension of models of the contexts."""
+    return value.expand(*context.shape[:-1], *value.shape[-event_dims:])

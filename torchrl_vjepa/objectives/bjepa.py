@@ -86,7 +86,8 @@ class BJEPALoss(VJEPALoss):
         else:
             means = self._pair_means("structural", outputs, masks)
             structural = self._reduce_means(means, outputs, masks)
-            terms["structural_kl"] = self._over_skips(means).detach()
+            if self._wants_diagnostics:
+                terms["structural_kl"] = self._over_skips(means).detach()
         terms["loss_structural_kl"] = self.structural_kl_coeff * structural
         return terms
 

@@ -108,5 +108,7 @@ class JEPALoss(LatentPredictionLoss):
             return {"loss_prediction": self.prediction_coeff * self._pad_pairs("error", outputs, masks)}
         errors = self._pair_means("error", outputs, masks)
         terms = {"loss_prediction": self.prediction_coeff * self._reduce_means(errors, outputs, masks)}
-        terms |= {f"error_skip_{s}": e.detach() for s, e in zip(self.skips, errors, strict=True)}
+        if self._wants_diagnostics:
+            pairs = zip(self.skips, errors, strict=True)
+            terms |= {f"error_skip_{skip}": error.detach() for skip, error in pairs}
         return terms

@@ -11,7 +11,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
-from torchrl_vjepa.distributions import diag_gaussian
 from torchrl_vjepa.heads import TargetScale
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
@@ -154,19 +153,22 @@ class VJEPALoss(LatentPredictionLoss):
         self, outputs: dict[str, Tensor], data: TensorDictBase, params: dict[str, TensorDictBase]
     ) -> Tensor:
         # Whatever an observation is, the scale reads it as one vector.
-        observation = data.get(self.scale.in_keys[0]).flatten(2)
+        rows = data.get(self.scale.in_keys[0]).flatten(data.ndim).flatten(-3, -2)
         with params["scale"].to_module(self.scale):
             module = self.scale.module
-            if isinstance(module, TargetScale):
-                log_var = module.log_variance(observation)
-            else:
-                log_var = 2 * module(observation).log()
+            log_var = module.log_variance(rows) if isinstance(module, TargetScale) else 2 * module(rows).log()
         log_var = log_var.float() if log_var.dtype in (torch.float16, torch.bfloat16) else log_var
+        if log_var.ndim > 1:  # (*N, R, D), or (*N, 1, D) where rows share it
+            shared = log_var.shape[-2] == 1
+            log_var = log_var.unflatten(-2, (1, 1) if shared else data.shape[-2:])
         if self.target_scale_gradient == "none":
             log_var = log_var.detach()
         outputs["target_log_var"] = log_var
-        spread = log_var if self.target_scale_gradient == "both" else log_var.detach()
-        return diag_gaussian(outputs["target"], log_var=spread).rsample()
+        std = (0.5 * (log_var if self.target_scale_gradient == "both" else log_var.detach())).exp()
+        # The same noise for all models: adding or removing one changes no other.
+        mean = outputs["target"]
+        noise = torch.randn(mean.shape[-3:], dtype=mean.dtype, device=mean.device)
+        return torch.addcmul(mean, std.to(mean.dtype), noise)
 
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
         if self.residual_variance == "head":
@@ -188,27 +190,29 @@ class VJEPALoss(LatentPredictionLoss):
         if self.residual_variance == "head":
             nlls = head_nlls
         else:
-            nlls = [self._profile_nll(outputs, masks, skip) for skip in self.skips]
+            nlls = self._profile_means(outputs, masks)
             terms["loss_head"] = self._reduce_means(head_nlls, outputs, masks)
         terms["loss_nll"] = self._reduce_means(nlls, outputs, masks)
 
-        latent, mask = outputs["target"], rows_of(masks.get("steps"))
-        mean, covariance = row_moments(latent.flatten(-3, -2), mask)
-        # E KL(q || N(0, I)) = (E |f|^2 + E[sigma^2 - 1 - log sigma^2]) / 2, and E |f|^2 is in the moments.
-        square = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) + mean.square().sum(-1)
+        # KL(q || N(0, I)) = (|f|^2 + sum_d (sigma_d^2 - 1 - log sigma_d^2)) / 2
+        rows, mask = outputs["target"].flatten(-3, -2), rows_of(masks.get("steps"))
+        square = mean_over(rows.square().sum(-1), mask)
         kl = 0.5 * (square + self._scale_divergence(outputs, mask))
         terms["loss_target_kl"] = self.target_kl_coeff * kl
         if self.reduction == "sum":
-            steps = latent.shape[-3] * latent.shape[-2] if mask is None else mask.sum(-1)
+            steps = rows.shape[-2] if mask is None else mask.sum(-1)
             terms["loss_target_kl"] = terms["loss_target_kl"] * steps
 
-        with torch.no_grad():
-            terms["target_kl"] = kl.detach()
-            variance = self._target_variance(outputs, mask)
-            terms["target_std"] = variance.sqrt().mean(-1)
-            entropy = covariance_entropy(covariance + torch.diag_embed(variance))
-            terms["mutual_information"] = entropy - self._over_skips(nlls)
-            terms |= {f"nll_skip_{s}": nll.detach() for s, nll in zip(self.skips, head_nlls, strict=True)}
+        if self._wants_diagnostics:
+            with torch.no_grad():
+                _, covariance = row_moments(rows, mask)
+                variance = self._target_variance(outputs, mask)
+                terms["target_kl"] = kl.detach()
+                terms["target_std"] = variance.sqrt().mean(-1)
+                entropy = covariance_entropy(covariance + torch.diag_embed(variance))
+                terms["mutual_information"] = entropy - self._over_skips(nlls)
+            pairs = zip(self.skips, head_nlls, strict=True)
+            terms |= {f"nll_skip_{skip}": nll.detach() for skip, nll in pairs}
         return terms
 
     def _terms_of_each_pair(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -218,7 +222,7 @@ class VJEPALoss(LatentPredictionLoss):
             terms["loss_nll"] = self._pad_pairs("nll", outputs, masks)
         else:
             terms["loss_head"] = self._pad_pairs("nll", outputs, masks)
-            profile = {f"profile_{s}": self._profile_nlls(outputs, masks, s) for s in self.skips}
+            profile = self._profile_nlls(outputs, masks)
             terms["loss_nll"] = self._pad_pairs("profile", {**outputs, **profile}, masks)
         latent, log_var = outputs["target"], self._log_var(outputs)
         kl = 0.5 * (latent.square() + log_var.exp() - 1 - log_var).sum(-1)
@@ -247,31 +251,35 @@ class VJEPALoss(LatentPredictionLoss):
             return variance[..., 0, 0, :]
         return mean_over(variance.flatten(-3, -2).mT, None if mask is None else mask.unsqueeze(-2))
 
-    @staticmethod
-    def _profile(
-        outputs: dict[str, Tensor], masks: dict[str, Tensor], skip: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Second moment of the residuals, its inverse, and the constant of the likelihood.
+    def _profile(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Second moments of the residuals, their inverses, and the constants of the likelihoods.
 
         At its optimum the covariance has no gradient, so it is a constant here: the gradient is that of
-        the profile likelihood, :math:`\frac12 \log\det \mathbb E\, r r^\top`.
+        the profile likelihood, :math:`\frac12 \log\det \mathbb E\, r r^\top`. All skips at once:
+        ``(*N, S, D, D)`` twice, and ``(*N, S)``.
         """
-        moment = second_moment(outputs[f"residual_{skip}"], rows_of(masks.get(str(skip))))
+        moment = torch.stack(
+            [second_moment(outputs[f"residual_{s}"], rows_of(masks.get(str(s)))) for s in self.skips], dim=-3
+        )
         with torch.no_grad():
             variance = moment.diagonal(dim1=-2, dim2=-1).mean(-1)
             eye = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
-            covariance = moment + (1e-6 * variance + 1e-12)[..., None, None] * eye
+            covariance = torch.addcmul(moment, (1e-6 * variance + 1e-12)[..., None, None], eye)
             precision = torch.linalg.inv(covariance)
             constant = torch.logdet(covariance) + moment.shape[-1] * math.log(2 * math.pi)
         return moment, precision, constant
 
-    def _profile_nll(self, outputs: dict[str, Tensor], masks: dict[str, Tensor], skip: int) -> Tensor:
-        """Mean of :meth:`_profile_nlls`, which the second moments of the residuals give; ``(*N)``."""
-        moment, precision, constant = self._profile(outputs, masks, skip)
-        return 0.5 * ((precision * moment).sum((-2, -1)) + constant)
+    def _profile_means(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> list[Tensor]:
+        """Means of :meth:`_profile_nlls`, which the second moments of the residuals give; each ``(*N)``."""
+        moment, precision, constant = self._profile(outputs, masks)
+        return list((0.5 * ((precision * moment).sum((-2, -1)) + constant)).unbind(-1))
 
-    def _profile_nlls(self, outputs: dict[str, Tensor], masks: dict[str, Tensor], skip: int) -> Tensor:
-        """Gaussian likelihood at the residual covariance that is optimal for the batch; ``(*N, R)``."""
-        _, precision, constant = self._profile(outputs, masks, skip)
-        residual = outputs[f"residual_{skip}"]
-        return 0.5 * ((residual @ precision * residual).sum(-1) + constant.unsqueeze(-1))
+    def _profile_nlls(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Gaussian likelihoods at the residual covariances that are optimal for the batch; ``(*N, R)``."""
+        _, precision, constant = self._profile(outputs, masks)
+        nlls = {}
+        for i, skip in enumerate(self.skips):
+            residual = outputs[f"residual_{skip}"]
+            quadratic = (residual @ precision[..., i, :, :] * residual).sum(-1)
+            nlls[f"profile_{skip}"] = 0.5 * (quadratic + constant[..., i, None])
+        return nlls

@@ -70,6 +70,8 @@ class WindowLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     _vmap_randomness = "same"
+    #: Whether the modules take the stacked parameters of several models: then nothing is mapped.
+    _stackable = False
     _model_type: type = torch.nn.Module
 
     def __init__(
@@ -184,6 +186,43 @@ class WindowLoss(LossModule):
     def out_keys(self, keys: list[NestedKey]) -> None:
         self._out_keys = keys
 
+    def select_out_keys(self, *out_keys: NestedKey) -> WindowLoss:
+        """Compute and return these entries only; diagnostics that nobody asks for cost nothing.
+
+        TorchRL's own takes a batch without the optional ``done`` for positional arguments and fails.
+
+        Args:
+            *out_keys: a subset of ``out_keys``.
+
+        Returns:
+            The loss itself.
+
+        Raises:
+            ValueError: if a key is not among ``out_keys``.
+        """
+        self._out_keys = None
+        unknown = [key for key in out_keys if key not in self.out_keys]
+        if unknown or not out_keys:
+            raise ValueError(f"out_keys must be some of {self.out_keys}, got {list(out_keys)}")
+        self._out_keys = list(out_keys)
+        return self
+
+    def reset_out_keys(self) -> WindowLoss:
+        """Return all entries again.
+
+        Returns:
+            The loss itself.
+        """
+        self._out_keys = None
+        return self
+
+    @property
+    def _wants_diagnostics(self) -> bool:
+        """Whether any is asked for: ``select_out_keys`` can leave out what a training step does not need."""
+        if self.reduction == "none":
+            return False
+        return self._out_keys is None or any(key in self._out_keys for key in self._diagnostic_keys())
+
     # What a member adds
 
     def _required_keys(self) -> list[NestedKey]:
@@ -205,7 +244,7 @@ class WindowLoss(LossModule):
         return tuple(getattr(self, f"{name}_params") for name in self._modules_of_model)
 
     def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
-        """What the modules of one model make of windows ``(B, T)``; mapped over the models."""
+        """What the modules make of windows ``(B, T)``: of one model, mapped over, or of all if stackable."""
         raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
 
     def _terms(
@@ -260,7 +299,7 @@ class WindowLoss(LossModule):
         """
         data, masks = self._read(tensordict)
         params = self._params()
-        if self.num_models is None:
+        if self.num_models is None or self._stackable:
             outputs = self._networks(data, *params)
         else:
             # Only what depends on modules is mapped: the rest is arithmetic on larger tensors.
@@ -361,7 +400,12 @@ class WindowLoss(LossModule):
         with params.to_module(encoder):
             if type(encoder) is TensorDictModule and encoder.out_keys == [latent_key]:
                 # A plain network needs no tensordict.
-                latent = encoder.module(*[data.get(key) for key in encoder.in_keys])
+                inputs = [data.get(key) for key in encoder.in_keys]
+                if getattr(encoder.module, "row_wise", False):
+                    # A matrix, and not a stack of them, stays one product when models are mapped over.
+                    latent = encoder.module(inputs[0].flatten(-3, -2)).unflatten(-2, data.shape[-2:])
+                else:
+                    latent = encoder.module(*inputs)
             else:
                 latent = encoder(data.copy()).get(latent_key)
         return latent.float() if latent.dtype in (torch.float16, torch.bfloat16) else latent
