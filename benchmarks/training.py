@@ -95,6 +95,9 @@ def bare_step(loss: VJEPALoss, size: str, windows: TensorDict) -> Callable[[], T
     num, rows, length, _ = x.shape
     flat = x.reshape(num, rows * length, OBSERVATION)
 
+    def noise() -> Tensor:
+        return torch.randn(LATENT, rows, length).movedim(0, -1).contiguous()
+
     def likelihood(error: Tensor, log_var: Tensor) -> Tensor:
         return 0.5 * (error.square() * (-log_var).exp() + log_var + math.log(2 * math.pi)).sum(-1).mean(-1)
 
@@ -104,7 +107,7 @@ def bare_step(loss: VJEPALoss, size: str, windows: TensorDict) -> Callable[[], T
         with torch.no_grad():
             mean = torch.bmm(flat, target.mT)
         log_var = torch.bmm(flat, scale.mT)
-        aim = mean + (0.5 * log_var.detach()).exp() * torch.randn(rows, length, LATENT).reshape(-1, LATENT)
+        aim = mean + (0.5 * log_var.detach()).exp() * noise().reshape(-1, LATENT)
         features = torch.bmm(latent[:, :-1], trunks[0].mT)
         prediction, spread = features.chunk(2, dim=-1)
         kl = 0.5 * (mean.square() + log_var.exp() - 1 - log_var).sum(-1).mean(-1)
@@ -117,7 +120,7 @@ def bare_step(loss: VJEPALoss, size: str, windows: TensorDict) -> Callable[[], T
         z = latent.reshape(num, rows, length, LATENT)
         with torch.no_grad():
             aim = torch.bmm(flat, target.mT).reshape_as(z)
-            aim = aim + STD * torch.randn(rows, length, LATENT)
+            aim = aim + STD * noise()
         terms = []
         for i, skip in enumerate(skips):
             context = z[:, :, :-skip].reshape(num, -1, LATENT)

@@ -21,6 +21,7 @@ PACKAGE = ROOT / "torchrl_vjepa"
 # Files and folders directly under the package; a folder's leaves share its layer.
 LAYERS = {
     "distributions": 0,
+    "stacking": 0,
     "noisy_tv": 0,
     "statistics": 0,
     "windows": 0,
@@ -40,6 +41,7 @@ LAYERS = {
 }
 # Who may import whom within one layer.
 SIDEWAYS = {
+    ("statistics", "stacking"),
     ("encoders", "whitening"),
     ("baselines", "models"),
     ("baselines", "objectives"),

@@ -11,9 +11,10 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictPara
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_vjepa.distributions import Delta, diag_gaussian
+from torchrl_vjepa.distributions import Delta
 from torchrl_vjepa.models import LatentModel
 from torchrl_vjepa.objectives import WindowLoss
+from torchrl_vjepa.stacking import StackableLinear, shared_noise
 from torchrl_vjepa.windows import read
 
 __all__ = ["VAE", "PixelAR", "PixelARLoss", "PixelDecoder", "VAELoss"]
@@ -299,14 +300,13 @@ class VAELoss(WindowLoss):
 
     def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
         encoder_params, decoder_params = params
-        # Rows: a matrix stays one product when several models are mapped over.
-        observation = data.get(self.encoder.in_keys[0]).flatten(0, 1)
+        observation = self._flat(data.get(self.encoder.in_keys[0]))
         with encoder_params.to_module(self.encoder):
             posterior = self.encoder.module(observation)
         if posterior.dtype in (torch.float16, torch.bfloat16):
             posterior = posterior.float()
         mean, log_var = posterior.chunk(2, dim=-1)
-        latent = diag_gaussian(mean, log_var=log_var).rsample()
+        latent = torch.addcmul(mean, (0.5 * log_var).exp(), shared_noise(mean, 2))
         with decoder_params.to_module(self.decoder):
             decoded = self.decoder.module(latent)
         return {
@@ -385,11 +385,13 @@ class PixelARLoss(WindowLoss):
         encoder_params, decoder_params = params
         observation = data.get(self.encoder.in_keys[0])
         latent_key, *action_keys = self.decoder.in_keys
-        latent = self._encode(data[:, :-1], encoder_params, latent_key).flatten(0, 1)
-        actions = [data.get(key)[:, :-1].flatten(0, 1) for key in action_keys]
+        latent = self._flat(self._encode(data, encoder_params, latent_key)[..., :-1, :])
+        actions = [self._flat(data.get(key)[..., :-1, :]) for key in action_keys]
+        actions = [action.expand(*latent.shape[:-1], -1) for action in actions]
         with decoder_params.to_module(self.decoder):
             predicted = self.decoder.module(latent, *actions)
-        return {"error": (predicted - observation[:, 1:].flatten(0, 1)).square().sum(-1)}
+        target = self._flat(observation[..., 1:, :])
+        return {"error": (predicted - target).square().sum(-1)}
 
     def _terms(
         self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
@@ -406,6 +408,10 @@ class _Decode(nn.Module):
         super().__init__()
         self.trunk = trunk
         self.latent_dim, self.action_dim = latent_dim, action_dim
+
+    @property
+    def stackable(self) -> bool:
+        return getattr(self.trunk, "stackable", False)
 
     def forward(self, latent: Tensor, action: Tensor | None = None) -> Tensor:
         return self.trunk(_joined(latent, action, self.latent_dim, self.action_dim))
@@ -427,7 +433,7 @@ def _trunk(
     trunk: Literal["linear", "mlp"], in_features: int, out_features: int, num_cells: Sequence[int]
 ) -> nn.Module:
     if trunk == "linear":
-        return nn.Linear(in_features, out_features, bias=False)
+        return StackableLinear(in_features, out_features, bias=False)
     if trunk == "mlp":
         return MLP(in_features, out_features, num_cells=list(num_cells))
     raise ValueError(f"trunk must be 'linear' or 'mlp', got {trunk!r}")

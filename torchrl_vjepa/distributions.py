@@ -146,12 +146,13 @@ def diag_gaussian(
     spread = log_var if scale is None else scale
     if spread is None or (scale is not None and log_var is not None):
         raise ValueError(
-            "exactly one of scale and log_var must be given, got "
-            f"{'neither' if spread is None else 'both'}"
+            f"exactly one of scale and log_var must be given, got {'neither' if spread is None else 'both'}"
         )
     # Under autocast a learned scale keeps its dtype, and torch.normal refuses two.
-    dtype = torch.promote_types(loc.dtype, spread.dtype)
-    return _DiagGaussian(loc.to(dtype), spread.to(dtype), scale is None, log_var_range)
+    if loc.dtype != spread.dtype:
+        dtype = torch.promote_types(loc.dtype, spread.dtype)
+        loc, spread = loc.to(dtype), spread.to(dtype)
+    return _DiagGaussian(loc, spread, scale is None, log_var_range)
 
 
 class _DiagGaussian(Independent):
@@ -226,14 +227,11 @@ class _DiagGaussian(Independent):
         deviation = value - self.loc
         constant = 0.5 * value.shape[-1] * math.log(2 * math.pi)
         if self._given.ndim == 1 or (self._given.shape[-2] == 1 and deviation.ndim > 1):
-            # Shared by the rows: one product with a vector, and one constant.
-            precision = self.precision
-            weights = precision if precision.ndim == 1 else precision.mT
-            quadratic = deviation.square() @ weights
-            quadratic = quadratic if precision.ndim == 1 else quadratic.squeeze(-1)
-            return -0.5 * quadratic - (constant + 0.5 * self.log_var.sum(-1))
+            # Shared by the rows: one constant for all.
+            quadratic = (deviation.square() * self.precision).sum(-1)
+            return torch.sub(-(constant + 0.5 * self.log_var.sum(-1)), quadratic, alpha=0.5)
         terms = torch.addcmul(self.log_var, deviation.square(), self.precision)
-        return -0.5 * terms.sum(-1) - constant
+        return terms.sum(-1).mul(-0.5).sub_(constant)
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         shape = (*sample_shape, *self.loc.shape)

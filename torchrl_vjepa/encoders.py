@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -48,7 +49,8 @@ class _ObservationNetwork(nn.Module):
         return isinstance(self.network, nn.Linear)
 
     def _linear(self, observation: Tensor) -> Tensor:
-        weight, bias = self.network.weight, self.network.bias
+        weight: Any = self.network.weight
+        bias: Any = self.network.bias
         if self.whitening is None:
             return linear(observation, weight, bias)
         # One product instead of two; for several models at once the larger one is not repeated.

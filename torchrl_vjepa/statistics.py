@@ -12,6 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+from torchrl_vjepa.stacking import products
+
 __all__ = [
     "covariance_entropy",
     "covariance_rank",
@@ -94,7 +96,7 @@ def row_moments(x: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
             shifted = torch.where(mask, x - shift, 0)
         mean = shifted.sum(-2) / count
         scale = count.unsqueeze(-1) if isinstance(count, Tensor) else count
-        covariance = shifted.mT @ shifted / scale - mean.unsqueeze(-1) * mean.unsqueeze(-2)
+        covariance = products(shifted) / scale - mean.unsqueeze(-1) * mean.unsqueeze(-2)
     return shift.squeeze(-2) + mean, covariance
 
 

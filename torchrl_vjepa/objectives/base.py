@@ -9,13 +9,14 @@ from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
 from torchrl_vjepa.models import JEPA
 from torchrl_vjepa.objectives.pairs import Pairs, mean_over, rows_of
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 from torchrl_vjepa.predictor import Predictor
+from torchrl_vjepa.stacking import features_first
 from torchrl_vjepa.statistics import (
     eigenvalues,
     row_distance,
@@ -139,16 +140,9 @@ class LatentPredictionLoss(WindowLoss):
             self.register_buffer("sliced_entropy_coeff", None)
         else:
             self._register_coeff("sliced_entropy_coeff", sliced_entropy_coeff)
-        self._stackable = all(getattr(module, "stackable", False) for module in self._plain_modules())
         self.collapse_rank = float(collapse_rank)
         self._calls = 0
         self._warned = False
-
-    def _plain_modules(self) -> Iterator[torch.nn.Module]:
-        """The modules of the model without the TensorDictModules around them."""
-        for name in self._modules_of_model:
-            module = getattr(self, name)
-            yield module.module if type(module) is TensorDictModule else module
 
     def _required_keys(self) -> list[NestedKey]:
         return [self.encoder.in_keys[0], *self.predictor.in_keys[1:]]
@@ -203,11 +197,14 @@ class LatentPredictionLoss(WindowLoss):
         side_info = data.get(predictor.side_info_key) if predictor.side_info_dim else None
         with named["predictor"].to_module(predictor):
             for skip in predictor.skips:
-                context = latent[..., :-skip, :].flatten(-3, -2)
-                chunks = None if action is None else _like(context, action_chunks(action, skip).flatten(-4, -3), 2)
-                info = None if side_info is None else _like(context, side_info[..., skip:, :].flatten(-3, -2), 1)
+                context = self._flat(latent[..., :-skip, :])
+                chunks = info = None
+                if action is not None:
+                    chunks = _like(context, action_chunks(action, skip).flatten(-4, -3), 2)
+                if side_info is not None:
+                    info = _like(context, side_info[..., skip:, :].flatten(-3, -2), 1)
                 p = predictor.dist(context, chunks, skip=skip, side_info=info)
-                pairs = Pairs(skip, p, target[..., skip:, :].flatten(-3, -2), context, chunks, info)
+                pairs = Pairs(skip, p, self._flat(target[..., skip:, :]), context, chunks, info)
                 with torch.autocast(latent.device.type, enabled=False):
                     of_pairs = self._pair_outputs(pairs, named)
                 outputs.update({f"{name}_{skip}": value for name, value in of_pairs.items()})
@@ -217,12 +214,13 @@ class LatentPredictionLoss(WindowLoss):
         self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
     ) -> dict[str, Tensor]:
         latent = outputs["latent"]
-        rows = latent.flatten(-3, -2)
+        rows = features_first(latent)
         mask = rows_of(masks.get("steps"))
         with torch.autocast(latent.device.type, enabled=False):
             terms = self._member_terms(outputs, masks)
             # Without a regulariser the moments are diagnostics: no gradient flows through them.
-            moved = any(map(self._is_active, ("variance_coeff", "covariance_coeff", "marginal_entropy_coeff")))
+            coeffs = ("variance_coeff", "covariance_coeff", "marginal_entropy_coeff")
+            moved = any(map(self._is_active, coeffs))
             if moved or self._wants_diagnostics or self.reduction == "none":
                 with torch.set_grad_enabled(moved and torch.is_grad_enabled()):
                     mean, covariance = row_moments(rows, mask)

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from torchrl_vjepa.stacking import products
+
 __all__ = ["Pairs", "mean_over", "rows_of", "second_moment"]
 
 
@@ -94,6 +96,6 @@ def second_moment(value: Tensor, mask: Tensor | None) -> Tensor:
         tensor([[5.]])
     """
     if mask is None:
-        return value.mT @ value / value.shape[-2]
+        return products(value) / value.shape[-2]
     count = mask.sum(-1).clamp_min(1)[..., None, None]
-    return value.mT @ torch.where(mask.unsqueeze(-1), value, 0) / count
+    return products(torch.where(mask.unsqueeze(-1), value, 0)) / count

@@ -15,6 +15,7 @@ from torchrl_vjepa.heads import TargetScale
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
 from torchrl_vjepa.objectives.pairs import Pairs, mean_over, rows_of, second_moment
+from torchrl_vjepa.stacking import features_first, shared_noise
 from torchrl_vjepa.statistics import covariance_entropy, row_moments
 
 __all__ = ["VJEPALoss"]
@@ -165,10 +166,8 @@ class VJEPALoss(LatentPredictionLoss):
             log_var = log_var.detach()
         outputs["target_log_var"] = log_var
         std = (0.5 * (log_var if self.target_scale_gradient == "both" else log_var.detach())).exp()
-        # The same noise for all models: adding or removing one changes no other.
         mean = outputs["target"]
-        noise = torch.randn(mean.shape[-3:], dtype=mean.dtype, device=mean.device)
-        return torch.addcmul(mean, std.to(mean.dtype), noise)
+        return torch.addcmul(mean, std.to(mean.dtype), shared_noise(mean, 3))
 
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
         if self.residual_variance == "head":
@@ -195,7 +194,7 @@ class VJEPALoss(LatentPredictionLoss):
         terms["loss_nll"] = self._reduce_means(nlls, outputs, masks)
 
         # KL(q || N(0, I)) = (|f|^2 + sum_d (sigma_d^2 - 1 - log sigma_d^2)) / 2
-        rows, mask = outputs["target"].flatten(-3, -2), rows_of(masks.get("steps"))
+        rows, mask = features_first(outputs["target"]), rows_of(masks.get("steps"))
         square = mean_over(rows.square().sum(-1), mask)
         kl = 0.5 * (square + self._scale_divergence(outputs, mask))
         terms["loss_target_kl"] = self.target_kl_coeff * kl

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_vjepa.objectives.pairs import mean_over
+from torchrl_vjepa.stacking import features_first
 from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
 
 __all__ = ["WindowLoss"]
@@ -110,8 +111,15 @@ class WindowLoss(LossModule):
             )
             if several and not stacked:
                 self._stack_one(name, parts[0], name in targets)
+        self._stackable = self._can_stack()
         self._set_in_keys()
         self._out_keys: list[NestedKey] | None = None
+
+    def _can_stack(self) -> bool:
+        """Whether every part of the model takes the stacked parameters of several models."""
+        parts = (getattr(self, name) for name in self._modules_of_model)
+        plain = (part.module if type(part) is TensorDictModule else part for part in parts)
+        return all(getattr(module, "stackable", False) for module in plain)
 
     def _stack_one(self, name: str, part: torch.nn.Module, has_target: bool) -> None:
         # Of a list of one TorchRL makes tensors that are no parameters: it takes them for shared ones.
@@ -409,6 +417,10 @@ class WindowLoss(LossModule):
             else:
                 latent = encoder(data.copy()).get(latent_key)
         return latent.float() if latent.dtype in (torch.float16, torch.bfloat16) else latent
+
+    def _flat(self, windows: Tensor) -> Tensor:
+        """Windows ``(*N, B, T, D)`` as rows ``(*N, B T, D)``."""
+        return features_first(windows) if self._stackable else windows.flatten(-3, -2)
 
     def _reduce(self, values: list[Tensor], masks: list[Tensor | None], length: int) -> Tensor:
         """Reduce one number for each pair (or step), over pairs and skips, as ``reduction`` says.
