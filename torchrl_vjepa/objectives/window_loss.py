@@ -231,11 +231,13 @@ class WindowLoss(LossModule):
             raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
         model = models[index or 0]
         for name, attribute in self._modules_of_model.items():
-            params = getattr(self, f"{name}_params").data
+            params = getattr(self, f"{name}_params")
+            own = TensorDict.from_module(getattr(model, attribute))
             # Of a single model these are its own, unless the loss was copied or unpickled.
-            TensorDict.from_module(getattr(model, attribute)).data.update_(
-                params if index is None else params[index]
-            )
+            own.data.update_(params.data if index is None else params.data[index])
+            # The first model of a list lends the loss its modules: their parameters come back frozen.
+            for key, value in own.items(True, True):
+                value.requires_grad_(params.get(key).requires_grad)
         return model
 
     @dispatch
