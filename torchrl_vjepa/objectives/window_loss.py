@@ -30,7 +30,8 @@ class WindowLoss(LossModule):
     number for each model, and their sum gives every model exactly the gradient that it has alone; with
     Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
     are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
-    trained one back. This is how restarts and ensembles are trained.
+    trained one back. This is how restarts and ensembles are trained. A new loss over the best few trains
+    them on: many starts a little, few of them longer (successive halving), chosen by the objective.
 
     Args:
         model: the model, or a list of models.
