@@ -32,7 +32,8 @@ class WindowLoss(LossModule):
     number for each model, and their sum gives every model exactly the gradient that it has alone; with
     Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
     are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
-    trained one back. This is how restarts and ensembles are trained.
+    trained one back. This is how restarts and ensembles are trained. A new loss over the best few trains
+    them on: many starts a little, few of them longer (successive halving), chosen by the objective.
 
     Args:
         model: the model, or a list of models.
@@ -283,11 +284,13 @@ class WindowLoss(LossModule):
             raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
         model = models[index or 0]
         for name, attribute in self._modules_of_model.items():
-            params = getattr(self, f"{name}_params").data
+            params = getattr(self, f"{name}_params")
+            own = TensorDict.from_module(getattr(model, attribute))
             # Of a single model these are its own, unless the loss was copied or unpickled.
-            TensorDict.from_module(getattr(model, attribute)).data.update_(
-                params if index is None else params[index]
-            )
+            own.data.update_(params.data if index is None else params.data[index])
+            # The first model of a list lends the loss its modules: their parameters come back frozen.
+            for key, value in own.items(True, True):
+                value.requires_grad_(params.get(key).requires_grad)
         return model
 
     @dispatch
