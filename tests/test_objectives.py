@@ -132,7 +132,7 @@ def test_jepa_loss_equals_a_loop(cls: type[JEPA]) -> None:
 
 @pytest.mark.parametrize("std", [1e-9, 0.7])
 def test_vjepa_loss_equals_torch_distributions(std: float) -> None:
-    """With std -> 0 the target is its mean; else the sample is drawn from the global seed, feature by feature."""
+    """With std -> 0 the target is its mean; else a sample is drawn, feature by feature."""
     loss = associated(VJEPALoss(make_model(std=std), target_kl_coeff=0.3))
     windows, done, is_init, mask = with_boundaries(make_windows(7, 9))
     latent, target = latents(loss, windows)

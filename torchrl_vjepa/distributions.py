@@ -156,7 +156,7 @@ def diag_gaussian(
 
 
 class _DiagGaussian(Independent):
-    """``Independent(Normal)`` that computes what is asked for, and keeps a spread that the batch shares small."""
+    """``Independent(Normal)`` that computes what is asked for and keeps a shared spread small."""
 
     def __init__(
         self,
