@@ -17,6 +17,7 @@ from torchrl_vjepa.noisy_tv import (
     NoisyTVEnv,
 )
 from torchrl_vjepa.objectives import (
+    AdaptiveCoefficient,
     BJEPALoss,
     CollapseWarning,
     JEPALoss,
@@ -32,6 +33,7 @@ from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_ga
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
+    "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
     "BatchedNoisyTVEnv",

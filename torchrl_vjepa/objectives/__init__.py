@@ -1,5 +1,6 @@
 """The losses of the paper as TorchRL LossModules."""
 
+from torchrl_vjepa.objectives.balancing import AdaptiveCoefficient
 from torchrl_vjepa.objectives.base import CollapseWarning, LatentPredictionLoss
 from torchrl_vjepa.objectives.bjepa import BJEPALoss
 from torchrl_vjepa.objectives.jepa import JEPALoss
@@ -8,6 +9,7 @@ from torchrl_vjepa.objectives.vjepa import VJEPALoss
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 
 __all__ = [
+    "AdaptiveCoefficient",
     "BJEPALoss",
     "CollapseWarning",
     "JEPALoss",

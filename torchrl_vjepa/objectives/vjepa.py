@@ -38,9 +38,9 @@ class VJEPALoss(LatentPredictionLoss):
     Entries: ``loss_nll``, ``loss_target_kl``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``,
     with ``residual_variance="batch"`` also ``loss_head``, with ``sliced_entropy_coeff`` also
     ``loss_sliced``. Diagnostics:
-    ``effective_rank``, ``latent_std``, ``target_std``, ``mutual_information`` (the Gaussian form of
-    the bound of ``thm:mi_bound``, in nats, mean over skips: the score by which restarts are chosen),
-    ``nll_skip_<k>``.
+    ``effective_rank``, ``latent_std``, ``target_std``, ``target_kl`` (in nats, without :math:`\beta`),
+    ``mutual_information`` (the Gaussian form of the bound of ``thm:mi_bound``, in nats, mean over skips:
+    the score by which restarts are chosen), ``nll_skip_<k>``.
 
     Args:
         model: the model, or a list of models that train as one batch (:class:`LatentPredictionLoss`).
@@ -145,7 +145,7 @@ class VJEPALoss(LatentPredictionLoss):
 
     def _diagnostic_keys(self) -> Iterator[str]:
         yield from super()._diagnostic_keys()
-        yield from ("target_std", "mutual_information")
+        yield from ("target_std", "target_kl", "mutual_information")
         yield from (f"nll_skip_{skip}" for skip in self.predictor.skips)
 
     def _target_std(self, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
@@ -193,6 +193,10 @@ class VJEPALoss(LatentPredictionLoss):
             with torch.no_grad():
                 means = [pair.mean(nll) for pair, nll in zip(pairs, nlls, strict=True)]
                 terms["target_std"] = std.mean()
+                # Not that of the loss: it may be a sum, and it is weighted.
+                terms["target_kl"] = (
+                    kl.mean() if mask is None else torch.where(mask, kl, 0).sum() / mask.sum().clamp_min(1)
+                )
                 _, covariance = masked_moments(pairs[0].target, pairs[0].mask)
                 nll = sum(w * m for w, m in zip(self.skip_weights, means, strict=True))
                 terms["mutual_information"] = covariance_entropy(covariance) - nll

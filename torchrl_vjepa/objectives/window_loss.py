@@ -30,7 +30,8 @@ class WindowLoss(LossModule):
     number for each model, and their sum gives every model exactly the gradient that it has alone; with
     Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
     are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
-    trained one back. This is how restarts and ensembles are trained.
+    trained one back. This is how restarts and ensembles are trained. The models share the coefficients of
+    the loss, unless a coefficient's buffer has shape ``(num_models,)``: one number for each model.
 
     Args:
         model: the model, or a list of models.
@@ -260,10 +261,10 @@ class WindowLoss(LossModule):
         else:
             in_dim = 0 if self.stacked_data else None
             terms = torch.vmap(
-                self._terms,
-                in_dims=(in_dim, in_dim, *[0] * len(params)),
+                self._terms_at,
+                in_dims=(0, in_dim, in_dim, *[0] * len(params)),
                 randomness=self._vmap_randomness,
-            )(data, masks, *params)
+            )(self._coeffs_of_models(), data, masks, *params)
         terms = {key: terms[key] for key in self.out_keys}
         if self.reduction == "none":
             lead = () if self.num_models is None else (self.num_models,)
@@ -274,6 +275,27 @@ class WindowLoss(LossModule):
         out = TensorDict(terms, batch_size=[])
         self._clear_weakrefs(tensordict, out, *[f"{name}_params" for name in self._modules_of_model])
         return out
+
+    def _terms_at(
+        self, coeffs: TensorDictBase, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """The terms of one model at its own coefficients."""
+        with coeffs.to_module(self):
+            return self._terms(data, masks, *params)
+
+    def _coeffs_of_models(self) -> TensorDictBase:
+        """Coefficients that differ from model to model; the others are scalars."""
+        coeffs = {}
+        for name in sorted(self._all_schedulable_buffers):
+            value = getattr(self, name)
+            if value is not None and value.ndim:
+                if value.shape != (self.num_models,):
+                    raise ValueError(
+                        f"{name} must be a scalar or have one entry for each of the {self.num_models} "
+                        f"models, got shape {tuple(value.shape)}"
+                    )
+                coeffs[name] = value
+        return TensorDict(coeffs, batch_size=[self.num_models])
 
     def _watch(self, terms: dict[str, Tensor]) -> None:
         """Called with the terms of all models."""
