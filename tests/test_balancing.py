@@ -109,11 +109,26 @@ def test_one_step_is_the_formula() -> None:
         assert loss.weight.item() == pytest.approx(0.7 * math.exp(0.3 * exponent))
 
 
+def test_damping_follows_the_change_of_the_excess() -> None:
+    """Over several steps: the rate times the sum of the excess, damping times its last minus its first."""
+    loss = Quadratic(0.0, lambda theta: theta, 0.7)
+    balancer = AdaptiveCoefficient(loss, "weight", "term", 2.0, rate=0.3, damping=0.8)
+    values = (2.5, 1.0, 9.0, 3.0)
+    for value in values:
+        balancer.step(TensorDict(term=torch.tensor(value, dtype=torch.float64)))
+    excess = [min(value / 2.0 - 1, 1.0) for value in values]
+    exponent = 0.3 * sum(excess) + 0.8 * (excess[-1] - excess[0])
+    assert loss.weight.item() == pytest.approx(0.7 * math.exp(exponent))
+
+
 def test_what_is_not_a_number_moves_nothing() -> None:
     loss = Quadratic(0.0, lambda theta: theta, 0.7)
     balancer = AdaptiveCoefficient(loss, "weight", "term", 0.5)
-    balancer.step(TensorDict(term=torch.tensor(math.nan, dtype=torch.float64)))
-    assert loss.weight.item() == 0.7
+    for value in (0.5, math.nan, 0.7):
+        balancer.step(TensorDict(term=torch.tensor(value, dtype=torch.float64)))
+        assert loss.weight.item() == pytest.approx(0.7)
+    balancer.step(TensorDict(term=torch.tensor(0.6, dtype=torch.float64)))  # damping and rate again
+    assert loss.weight.item() == pytest.approx(0.7 * math.exp(0.01 * 0.2 - 0.2))
 
 
 # --- beta and gamma
@@ -181,10 +196,10 @@ def test_beta_converges_to_the_multiplier_solved_by_hand() -> None:
     exact = s / ((1 - s) * (s + R))
     models = [formed(VJEPA, 0.8) for _ in range(3)]
     loss = VJEPALoss(models, target_kl_coeff=exact, target_scale_gradient="both")
-    balancer = AdaptiveCoefficient(loss, "target_kl_coeff", "target_kl", target, rate=0.05)
+    balancer = AdaptiveCoefficient(loss, "target_kl_coeff", "target_kl", target, rate=0.2, damping=3.0)
     loss.target_kl_coeff.mul_(torch.tensor([0.01, 1.0, 100.0]))
     moving = [p for n, p in loss.named_parameters() if n.startswith("scale") or n.endswith("constants")]
-    kl = train(loss, moving, [balancer], 450, "target_kl", adam=True, rate=0.03)
+    kl = train(loss, moving, [balancer], 400, "target_kl", adam=True, rate=0.1)
     assert (kl[0] / target).max() < 0.75  # it starts elsewhere
     torch.testing.assert_close(kl[-100:].mean(0), torch.full((3,), target), rtol=0.02, atol=0)
     torch.testing.assert_close(loss.target_kl_coeff, torch.full((3,), exact), rtol=0.15, atol=0)
@@ -226,13 +241,13 @@ def test_balancing_prevents_the_collapse_under_a_too_strong_coefficient(coeffici
             {"params": [p for p in loss.parameters() if p.ndim < 2]},
         ]
         balancer = [AdaptiveCoefficient(loss, f"{name}_coeff", name, target, rate=0.1)] if adaptive else []
-        information = train(loss, groups, balancer, 300, "mutual_information")[-1].item()
+        information = train(loss, groups, balancer, 250, "mutual_information")[-1].item()
         weight = loss.get_model().encoder.module.network.weight.detach()
         spread[adaptive] = (weight[:, :2].norm().item() / math.sqrt(2), information)
-    assert spread[False][0] < 0.35
+    assert spread[False][0] < 0.4
     assert spread[False][1] < 0.1
     assert spread[True][0] > 0.75
-    assert spread[True][1] > 1.0
+    assert spread[True][1] > 0.8
 
 
 # --- the diagnostic
@@ -406,6 +421,7 @@ def vjepa_loss(**kwargs: Any) -> VJEPALoss:
         ({"target": math.nan}, "target must be finite"),
         ({"rate": 0.0}, "rate must be finite and positive, got 0.0"),
         ({"rate": math.inf}, "rate must be finite and positive, got inf"),
+        ({"damping": -1.0}, "damping must be finite and at least 0, got -1.0"),
         ({"bounds": (0.0, 1.0)}, "bounds must be finite"),
         ({"bounds": (1.0, 1.0)}, "bounds must be finite"),
         ({"bounds": (1.0, math.inf)}, "bounds must be finite"),
@@ -438,7 +454,9 @@ def test_bad_losses_and_states_are_refused() -> None:
     ):
         balancer.step(TensorDict(target_kl=torch.zeros(2)))
     state = balancer.state_dict()
-    with pytest.raises(ValueError, match="state_dict must hold 'coefficient', 'rate' and 'target'"):
+    with pytest.raises(
+        ValueError, match="state_dict must hold \\['coefficient', 'excess', 'rate', 'target'\\], got"
+    ):
         balancer.load_state_dict({"target": 1.0})
     with pytest.raises(ValueError, match=r"a coefficient of shape \(\), got \(2,\)"):
         balancer.load_state_dict({**state, "coefficient": torch.zeros(2)})

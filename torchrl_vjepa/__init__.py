@@ -23,8 +23,10 @@ from torchrl_vjepa.objectives import (
     JEPALoss,
     LatentPredictionLoss,
     RewardLoss,
+    Selection,
     VJEPALoss,
     WindowLoss,
+    select_best,
 )
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
@@ -67,6 +69,7 @@ __all__ = [
     "QuadraticReward",
     "RandomShooting",
     "RewardLoss",
+    "Selection",
     "TargetScale",
     "VAE",
     "VAELoss",
@@ -89,5 +92,6 @@ __all__ = [
     "quadratic_cost",
     "rollout",
     "sample",
+    "select_best",
     "sliced_gaussian_distance",
 ]

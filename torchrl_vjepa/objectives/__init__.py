@@ -5,6 +5,7 @@ from torchrl_vjepa.objectives.base import CollapseWarning, LatentPredictionLoss
 from torchrl_vjepa.objectives.bjepa import BJEPALoss
 from torchrl_vjepa.objectives.jepa import JEPALoss
 from torchrl_vjepa.objectives.reward import RewardLoss
+from torchrl_vjepa.objectives.selection import Selection, select_best
 from torchrl_vjepa.objectives.vjepa import VJEPALoss
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 
@@ -15,6 +16,8 @@ __all__ = [
     "JEPALoss",
     "LatentPredictionLoss",
     "RewardLoss",
+    "Selection",
     "VJEPALoss",
     "WindowLoss",
+    "select_best",
 ]

@@ -25,12 +25,13 @@ class AdaptiveCoefficient:
     .. math::
         \min_\theta \max_{\lambda > 0}\; \mathcal L(\theta)
         + \lambda \big(K(\theta) - K_{\text{target}}\big), \qquad
-        \lambda \leftarrow \lambda \exp\!\Big(\eta\,
-        \mathrm{clip}\Big(\frac{K - K_{\text{target}}}{|K_{\text{target}}|}, -1, 1\Big)\Big)
+        \log\lambda \leftarrow \log\lambda + \eta\, e_t + \kappa\, (e_t - e_{t-1}), \qquad
+        e_t = \mathrm{clip}\Big(\frac{K - K_{\text{target}}}{|K_{\text{target}}|}, -1, 1\Big)
 
-    (exponentiated gradient: :math:`\lambda` stays positive and moves by a factor of at most
-    :math:`e^\eta` per step), clamped to ``bounds``. Where the constraint is slack, :math:`\lambda` falls
-    to the lower bound. :math:`\eta` should be small beside the rate at which the model learns.
+    (exponentiated gradient: :math:`\lambda` stays positive), clamped to ``bounds``. Where the constraint
+    is slack, :math:`\lambda` falls to the lower bound. The term with :math:`\kappa` changes no fixed
+    point; it damps the oscillation between model and multiplier, as the proportional part of a
+    controller does. :math:`\eta` should be small beside the rate at which the model learns.
 
     Used next to the optimizer, like :class:`~torchrl.objectives.SoftUpdate`: :meth:`step` after
     ``backward()``. The coefficient is the loss's own buffer: it can be read and set there, and
@@ -50,6 +51,7 @@ class AdaptiveCoefficient:
         target: :math:`K_{\text{target}}`, in the unit of the diagnostic (nats, for a divergence); not 0.
             An attribute that may be changed during training.
         rate: :math:`\eta`. An attribute, too.
+        damping: :math:`\kappa`.
         bounds: least and greatest value of the coefficient.
         limit: ``"upper"``: a larger coefficient lowers the diagnostic, which may be at most the target;
             ``"lower"``: a larger coefficient raises it, and it should be at least the target (an entropy or
@@ -67,12 +69,12 @@ class AdaptiveCoefficient:
         >>> loss = VJEPALoss(VJEPA(linear_encoder(20, 4), Predictor(4)), target_scale_gradient="both")
         >>> updater = SoftUpdate(loss, eps=0.99)
         >>> balancer = AdaptiveCoefficient(loss, "target_kl_coeff", "target_kl", target=8.0, rate=0.1)
-        >>> losses = loss(TensorDict(observation=torch.zeros(8, 5, 20), batch_size=(8, 5)))
+        >>> losses = loss(TensorDict(observation=torch.randn(8, 5, 20), batch_size=(8, 5)))
         >>> sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
         >>> updater.step()
-        >>> balancer.step(losses)  # the KL is 0 here: less than allowed, so beta falls
-        >>> round(loss.target_kl_coeff.item(), 5)  # from 0.01, by the factor exp(-0.1)
-        0.00905
+        >>> balancer.step(losses)  # the KL is less than allowed here, so beta falls
+        >>> losses["target_kl"] < 8.0, loss.target_kl_coeff < 0.01
+        (tensor(True), tensor(True))
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class AdaptiveCoefficient:
         target: float,
         *,
         rate: float = 0.01,
+        damping: float = 1.0,
         bounds: tuple[float, float] = (1e-6, 1e4),
         limit: Literal["upper", "lower"] = "upper",
     ) -> None:
@@ -103,6 +106,8 @@ class AdaptiveCoefficient:
             raise ValueError(f"target must be finite and not 0, got {target}")
         if not (math.isfinite(rate) and rate > 0):
             raise ValueError(f"rate must be finite and positive, got {rate}")
+        if not (math.isfinite(damping) and damping >= 0):
+            raise ValueError(f"damping must be finite and at least 0, got {damping}")
         low, high = bounds
         if not (0 < low < high and math.isfinite(high)):
             raise ValueError(f"bounds must be finite (low, high) with 0 < low < high, got {bounds}")
@@ -122,8 +127,10 @@ class AdaptiveCoefficient:
         self.diagnostic = diagnostic
         self.target = float(target)
         self.rate = float(rate)
+        self.damping = float(damping)
         self.bounds = (float(low), float(high))
         self.limit = limit
+        self._excess: Tensor | None = None  # of the last step
 
     @torch.no_grad()
     def step(self, losses: TensorDictBase) -> None:
@@ -150,17 +157,26 @@ class AdaptiveCoefficient:
         excess = (value.detach() - self.target) / abs(self.target)
         if self.limit == "lower":
             excess = -excess
-        growth = (self.rate * excess.nan_to_num(0.0).clamp(-1.0, 1.0)).exp()
+        excess = excess.clamp(-1.0, 1.0)
+        change = torch.zeros_like(excess) if self._excess is None else excess - self._excess
+        # What is not a number moves nothing, now or in the next step.
+        growth = (self.rate * excess + self.damping * change).nan_to_num(0.0).exp()
         multiplier.copy_((multiplier * growth).clamp(*self.bounds))
+        self._excess = excess
 
     def state_dict(self) -> dict[str, Any]:
-        """What a training run changes: the coefficient, the target and the rate.
+        """What a training run changes: the coefficient, the last excess, the target and the rate.
 
         Returns:
             A dictionary for :meth:`load_state_dict`.
         """
         multiplier: Tensor = getattr(self.loss, self.coefficient)
-        return {"coefficient": multiplier.clone(), "target": self.target, "rate": self.rate}
+        return {
+            "coefficient": multiplier.clone(),
+            "excess": self._excess,
+            "target": self.target,
+            "rate": self.rate,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Resume.
@@ -171,10 +187,9 @@ class AdaptiveCoefficient:
         Raises:
             ValueError: if it holds other entries, or the coefficient has another shape.
         """
-        if set(state_dict) != {"coefficient", "target", "rate"}:
-            raise ValueError(
-                f"state_dict must hold 'coefficient', 'rate' and 'target', got {sorted(state_dict)}"
-            )
+        expected = {"coefficient", "excess", "rate", "target"}
+        if set(state_dict) != expected:
+            raise ValueError(f"state_dict must hold {sorted(expected)}, got {sorted(state_dict)}")
         multiplier: Tensor = getattr(self.loss, self.coefficient)
         if state_dict["coefficient"].shape != multiplier.shape:
             raise ValueError(
@@ -182,4 +197,6 @@ class AdaptiveCoefficient:
                 f"got {tuple(state_dict['coefficient'].shape)}"
             )
         multiplier.copy_(state_dict["coefficient"])
+        excess: Tensor | None = state_dict["excess"]
+        self._excess = None if excess is None else excess.to(multiplier.device)
         self.target, self.rate = float(state_dict["target"]), float(state_dict["rate"])
