@@ -111,7 +111,7 @@ def test_squared_loss_equals_gaussian_likelihood(log_var: float) -> None:
 
 
 def test_ema_rule() -> None:
-    """eq:target_encoder_weights_EMA: theta' <- tau theta' + (1 - tau) theta, over several steps of a moving encoder."""
+    """eq:target_encoder_weights_EMA: theta' <- tau theta' + (1 - tau) theta, several times."""
     tau = 0.9
     model = make_model(6, 3)
     loss = JEPALoss(model)
@@ -156,7 +156,10 @@ def test_mean_targets_collapse_the_predictors_variance() -> None:
 
 
 def test_collapsed_encoder_is_not_a_global_optimum_under_target_diversity() -> None:
-    """thm:collapse_avoidance. Best collapsed solution: the aggregate entropy; what a predictor gains is the information."""
+    """thm:collapse_avoidance.
+
+    Best collapsed solution: the aggregate entropy; what a predictor gains is the information.
+    """
     a = torch.tensor([0.9, 0.6], dtype=torch.float64)
     context, target = linear_gaussian(500, a)
     model = make_model(2, 2)
@@ -216,7 +219,7 @@ def test_mutual_information_bound_holds_and_is_tight_at_the_true_model(residual_
 
 
 def test_nuisance_invariance() -> None:
-    """prop:nuisance_invariance: x = (signal, unpredictable noise): trained VJEPA gives the noise no weight."""
+    """prop:nuisance_invariance: x = (signal, unpredictable noise): VJEPA gives the noise no weight."""
     num, a = 400, 0.9
     noise_and_signal = exact_normal(num, 6)
     signal, drive = noise_and_signal[:, :1], noise_and_signal[:, 1:2]
