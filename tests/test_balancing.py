@@ -56,7 +56,7 @@ class Quadratic(LossModule):
         )
 
 
-def descend(loss: Quadratic, balancer: AdaptiveCoefficient, steps: int = 2000) -> None:
+def descend(loss: Quadratic, balancer: AdaptiveCoefficient, steps: int = 1500) -> None:
     optimizer = torch.optim.SGD(loss.parameters(), 0.01)
     for _ in range(steps):
         losses = loss(TensorDict())

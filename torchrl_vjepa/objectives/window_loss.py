@@ -277,13 +277,19 @@ class WindowLoss(LossModule):
         return out
 
     def _terms_at(
-        self, coeffs: TensorDictBase, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+        self,
+        coeffs: dict[str, Tensor],
+        data: TensorDictBase,
+        masks: dict[str, Tensor],
+        *params: TensorDictBase,
     ) -> dict[str, Tensor]:
         """The terms of one model at its own coefficients."""
-        with coeffs.to_module(self):
+        if not coeffs:
+            return self._terms(data, masks, *params)
+        with TensorDict(coeffs).to_module(self):
             return self._terms(data, masks, *params)
 
-    def _coeffs_of_models(self) -> TensorDictBase:
+    def _coeffs_of_models(self) -> dict[str, Tensor]:
         """Coefficients that differ from model to model; the others are scalars."""
         coeffs = {}
         for name in sorted(self._all_schedulable_buffers):
@@ -295,7 +301,7 @@ class WindowLoss(LossModule):
                         f"models, got shape {tuple(value.shape)}"
                     )
                 coeffs[name] = value
-        return TensorDict(coeffs, batch_size=[self.num_models])
+        return coeffs
 
     def _watch(self, terms: dict[str, Tensor]) -> None:
         """Called with the terms of all models."""
