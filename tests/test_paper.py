@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torch.distributions import MultivariateNormal
+from torch.distributions import MultivariateNormal, Normal, kl_divergence
 from torchrl.objectives import SoftUpdate
 
 from torchrl_vjepa import (
@@ -108,6 +108,23 @@ def test_squared_loss_equals_gaussian_likelihood(log_var: float) -> None:
     variance = model.predictor.dist(torch.zeros(3).double()).variance[0].item()
     constant = 1.5 * math.log(2 * math.pi * variance)
     torch.testing.assert_close(nll, error / (2 * variance) + constant, rtol=1e-6, atol=1e-6)
+
+
+def test_eq_vjepa_objective_regularises_the_target_towards_the_reference() -> None:
+    """The second term: beta E KL(q(Z | x) || N(0, I)), zero for a target that is the reference itself."""
+    model, beta = make_model(6, 3, std=0.5), 0.3
+    loss = associated(VJEPALoss(model, target_kl_coeff=beta, collapse_rank=0.0))
+    windows = TensorDict(observation=torch.randn(8, 5, 6, dtype=torch.float64), batch_size=(8, 5))
+    latent = windows["observation"] @ model.encoder.module.network.weight.detach().mT
+    reference = Normal(torch.zeros(3).double(), torch.ones(3).double())
+    kl = kl_divergence(Normal(latent, 0.5), reference).sum(-1).mean()
+    terms = loss(windows)
+    assert terms["loss_target_kl"].item() == pytest.approx(beta * kl.item(), rel=1e-5)
+    assert terms["target_kl"].item() == pytest.approx(kl.item(), rel=1e-5)
+    model = make_model(6, 3, std=1.0)
+    model.encoder.module.network.weight.data.zero_()
+    loss = associated(VJEPALoss(model, target_kl_coeff=beta, collapse_rank=0.0))
+    assert loss(windows)["loss_target_kl"].item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_ema_rule() -> None:
