@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from torchrl_vjepa.distributions import Delta, sample
-from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale, soft_clamp
+from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale
+from torchrl_vjepa.distributions import soft_clamp
 from torchrl_vjepa.predictor import Predictor
 
 # One line per head, and every test of TestEveryHead runs for it.

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictPara
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_vjepa.distributions import Delta
+from torchrl_vjepa.distributions import Delta, diag_gaussian
 from torchrl_vjepa.models import LatentModel
 from torchrl_vjepa.objectives import WindowLoss
 from torchrl_vjepa.windows import read
@@ -297,21 +297,28 @@ class VAELoss(WindowLoss):
     def _loss_keys(self) -> Iterator[str]:
         yield from ("loss_reconstruction", "loss_kl")
 
-    def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
         encoder_params, decoder_params = params
-        observation = data.get(self.encoder.in_keys[0])
-        mask, length = masks.get("steps"), observation.shape[1]
+        # Rows: a matrix stays one product when several models are mapped over.
+        observation = data.get(self.encoder.in_keys[0]).flatten(0, 1)
         with encoder_params.to_module(self.encoder):
             posterior = self.encoder.module(observation)
         if posterior.dtype in (torch.float16, torch.bfloat16):
             posterior = posterior.float()
         mean, log_var = posterior.chunk(2, dim=-1)
-        latent = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
+        latent = diag_gaussian(mean, log_var=log_var).rsample()
         with decoder_params.to_module(self.decoder):
-            error = (observation - self.decoder.module(latent)).pow(2).sum(-1)
-        kl = 0.5 * (log_var.exp() + mean.pow(2) - 1 - log_var).sum(-1)
+            decoded = self.decoder.module(latent)
+        return {
+            "error": (observation - decoded).square().sum(-1),
+            "kl": 0.5 * ((log_var.exp() + mean.square() - log_var).sum(-1) - mean.shape[-1]),
+        }
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        length, mask = data.shape[-1], masks.get("steps")
+        error, kl = (outputs[name].unflatten(-1, (-1, length)) for name in ("error", "kl"))
         return {
             "loss_reconstruction": self._reduce([error], [mask], length),
             "loss_kl": self.kl_coeff * self._reduce([kl], [mask], length),
@@ -374,18 +381,22 @@ class PixelARLoss(WindowLoss):
     def _loss_keys(self) -> Iterator[str]:
         yield "loss_reconstruction"
 
-    def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
         encoder_params, decoder_params = params
         observation = data.get(self.encoder.in_keys[0])
         latent_key, *action_keys = self.decoder.in_keys
-        latent = self._encode(data[:, :-1], encoder_params, latent_key)
-        actions = [data.get(key)[:, :-1] for key in action_keys]
+        latent = self._encode(data[:, :-1], encoder_params, latent_key).flatten(0, 1)
+        actions = [data.get(key)[:, :-1].flatten(0, 1) for key in action_keys]
         with decoder_params.to_module(self.decoder):
             predicted = self.decoder.module(latent, *actions)
-        error = (predicted - observation[:, 1:]).pow(2).sum(-1)
-        return {"loss_reconstruction": self._reduce([error], [masks.get("1")], observation.shape[1])}
+        return {"error": (predicted - observation[:, 1:].flatten(0, 1)).square().sum(-1)}
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        length = data.shape[-1]
+        error = outputs["error"].unflatten(-1, (-1, length - 1))
+        return {"loss_reconstruction": self._reduce([error], [masks.get("1")], length)}
 
 
 class _Decode(nn.Module):

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torchrl.modules import MLP, GRUModule
 
+from torchrl_vjepa.stacking import linear
 from torchrl_vjepa.whitening import Whitening, check_observation, check_size
 
 __all__ = ["history_encoder", "linear_encoder", "mlp_encoder"]
 
 
 class _ObservationNetwork(nn.Module):
-    """Check the observation, whiten it, encode it."""
+    """Check the observation, whiten it, encode it: each row for itself."""
+
+    row_wise = True
 
     def __init__(
         self,
@@ -36,14 +38,23 @@ class _ObservationNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         dtype = next(self.network.parameters()).dtype
         check_observation(observation, self.observation_dim, self.key, dtype)
-        if self.whitening is None:
-            return self.network(observation)
         if isinstance(self.network, nn.Linear):
-            # One product instead of two; for several models at once the larger one is not repeated.
-            weight = self.network.weight @ self.whitening.transform.mT
-            centered = observation - self.whitening.mean.to(observation.dtype)
-            return F.linear(centered, weight, self.network.bias)
-        return self.network(self.whitening(observation))
+            return self._linear(observation)
+        return self.network(observation if self.whitening is None else self.whitening(observation))
+
+    @property
+    def stackable(self) -> bool:
+        """Whether weights of several models, stacked, can be used as they are: see ``linear``."""
+        return isinstance(self.network, nn.Linear)
+
+    def _linear(self, observation: Tensor) -> Tensor:
+        weight, bias = self.network.weight, self.network.bias
+        if self.whitening is None:
+            return linear(observation, weight, bias)
+        # One product instead of two; for several models at once the larger one is not repeated.
+        weight = weight @ self.whitening.transform.mT
+        mean = self.whitening.mean.to(observation.dtype)
+        return linear(observation - (mean if mean.ndim == 1 else mean.unsqueeze(-2)), weight, bias)
 
 
 def linear_encoder(

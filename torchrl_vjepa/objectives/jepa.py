@@ -100,16 +100,15 @@ class JEPALoss(LatentPredictionLoss):
         yield from super()._diagnostic_keys()
         yield from (f"error_skip_{skip}" for skip in self.predictor.skips)
 
-    def _member_terms(
-        self,
-        pairs: list[Pairs],
-        target_latent: Tensor,
-        data: TensorDictBase,
-        mask: Tensor | None,
-        params: dict[str, TensorDictBase],
-    ) -> dict[str, Tensor]:
-        errors = [(pair.dist.mean - pair.target).pow(2).sum(-1) for pair in pairs]
-        terms = {"loss_prediction": self.prediction_coeff * self._reduce_pairs(errors, pairs)}
-        for pair, error in zip(pairs, errors, strict=True):
-            terms[f"error_skip_{pair.skip}"] = pair.mean(error).detach()
+    def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
+        return {"error": (pairs.dist.mean - pairs.target).square().sum(-1)}
+
+    def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        if self.reduction == "none":
+            return {"loss_prediction": self.prediction_coeff * self._pad_pairs("error", outputs, masks)}
+        errors = self._pair_means("error", outputs, masks)
+        terms = {"loss_prediction": self.prediction_coeff * self._reduce_means(errors, outputs, masks)}
+        if self._wants_diagnostics:
+            pairs = zip(self.skips, errors, strict=True)
+            terms |= {f"error_skip_{skip}": error.detach() for skip, error in pairs}
         return terms
