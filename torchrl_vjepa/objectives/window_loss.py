@@ -330,8 +330,8 @@ class WindowLoss(LossModule):
             if value is not None and value.ndim and value.shape != own:
                 raise ValueError(
                     f"{name} must be a scalar or, for a list of models and reduction='mean' or 'sum', have "
-                    f"one entry for each model, got shape {tuple(value.shape)} for num_models={self.num_models} "
-                    f"and reduction={self.reduction!r}"
+                    f"one entry for each model, got shape {tuple(value.shape)} for "
+                    f"num_models={self.num_models} and reduction={self.reduction!r}"
                 )
 
     def _watch(self, terms: dict[str, Tensor]) -> None:
