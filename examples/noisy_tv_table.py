@@ -197,8 +197,10 @@ def paper_model(name: str, settings: Settings) -> Any:
     if name == "JEPA":
         return JEPA(encoder, Predictor(latent_dim, head=DeltaHead()))
     model = {"VJEPA": VJEPA, "BJEPA": BJEPA}[name]
-    target_scale = TargetScale(latent_dim, observation_dim, kind="linear")
-    return model(encoder, Predictor(latent_dim), target_scale=target_scale)
+    # Log-variances without bounds, as printed.
+    target_scale = TargetScale(latent_dim, observation_dim, kind="linear", log_var_range=None)
+    head = DiagGaussianHead(log_var_range=None)
+    return model(encoder, Predictor(latent_dim, head=head), target_scale=target_scale)
 
 
 def paper_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowLoss:
@@ -266,6 +268,11 @@ def robust_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowL
 # Training: all runs of a model kind as one batch
 
 
+def select_objective(loss: WindowLoss) -> None:
+    """Training needs no diagnostics."""
+    loss.select_out_keys(*[key for key in loss.out_keys if key.startswith("loss_")])
+
+
 def objective(losses: TensorDict) -> Tensor:
     """What is minimised: the sum of the ``loss_*`` entries, one number for each model."""
     return sum(value for key, value in losses.items() if key.startswith("loss_"))
@@ -308,11 +315,13 @@ def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[
     if settings.encoder == "linear" and name in ("AR", "JEPA"):
         windows = same_moments(observations)
     else:
-        windows = observations.unsqueeze(1)
+        # Each feature side by side in memory: the layout in which the losses of linear models compute.
+        windows = observations.mT.contiguous().mT.unsqueeze(1)
     batch = TensorDict(observation=windows, batch_size=windows.shape[:-1])
     loss = paper_loss(name, make_models(paper_model, name, runs, 1, settings), settings)
     updater = SoftUpdate(loss, eps=EMA_DECAY) if name in LATENT_MODELS else None
     optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr or 1e-3, fused=True)
+    select_objective(loss)
     torch.manual_seed(0)
     for _ in range(settings.steps or 6000):
         objective(loss(batch)).sum().backward()
@@ -351,6 +360,7 @@ def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Set
         optimizer, [group["lr"] for group in groups], total_steps=steps, pct_start=0.2, cycle_momentum=False
     )
     starts_of_a_run = loss.num_models // len(observations)
+    select_objective(loss)
 
     def batch(starts: Tensor) -> TensorDict:
         windows = observations[:, starts.unsqueeze(1) + torch.arange(settings.window)]
@@ -371,11 +381,13 @@ def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Set
         optimizer.zero_grad()
         schedule.step()
         updater.step()
+    loss.reset_out_keys()
     with torch.no_grad():
         losses = loss(batch(torch.arange(0, last + 1, settings.window)))
     # The head's likelihood is that of a diagonal Gaussian, which depends on the basis of the latents.
     score = losses.get("mutual_information", -objective(losses))
-    return score.reshape(len(observations), starts_of_a_run)
+    # topk takes NaN for the largest number.
+    return score.nan_to_num(-torch.inf).reshape(len(observations), starts_of_a_run)
 
 
 # Evaluation

@@ -71,10 +71,14 @@ def pixel_ar(i: int) -> nn.Module:
 
 
 CASES: dict[str, tuple[Callable[..., Any], Callable[[int], nn.Module], dict[str, Any]]] = {
-    "JEPA": (JEPALoss, jepa, REGULARISERS),
+    "JEPA": (JEPALoss, jepa, {**REGULARISERS, "sliced_entropy_coeff": 0.4}),
     "VJEPA": (VJEPALoss, vjepa, {**REGULARISERS, "skip_weights": (1.0, 2.0), "sliced_entropy_coeff": 0.3}),
     "VJEPA batch": (VJEPALoss, vjepa, {**REGULARISERS, "residual_variance": "batch"}),
-    "BJEPA": (BJEPALoss, bjepa, {**REGULARISERS, "structural_kl_coeff": 0.4}),
+    "BJEPA": (
+        BJEPALoss,
+        bjepa,
+        {**REGULARISERS, "structural_kl_coeff": 0.4, "sliced_entropy_coeff": 0.2, "target_kl_coeff": 0.5},
+    ),
     "BJEPA fixed full prior": (BJEPALoss, bjepa_fixed, REGULARISERS),
     "VAE": (VAELoss, vae, {"kl_coeff": 0.5}),
     "PixelAR": (PixelARLoss, pixel_ar, {}),

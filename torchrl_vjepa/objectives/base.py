@@ -249,7 +249,7 @@ class LatentPredictionLoss(WindowLoss):
     def _is_active(self, coeff: str) -> bool:
         """Whether a coefficient may be other than zero; only on a CPU looking costs nothing."""
         value = getattr(self, coeff)
-        return torch.compiler.is_compiling() or value.device.type != "cpu" or bool(value != 0)
+        return torch.compiler.is_compiling() or value.device.type != "cpu" or bool((value != 0).any())
 
     def _pad_pairs(self, name: str, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> Tensor:
         """For ``reduction="none"``: the entries ``name`` of all skips as ``(*N, B, T)``."""

@@ -33,7 +33,9 @@ class WindowLoss(LossModule):
     Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
     are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
     trained one back. This is how restarts and ensembles are trained. A new loss over the best few trains
-    them on: many starts a little, few of them longer (successive halving), chosen by the objective.
+    them on: many starts a little, few of them longer (successive halving), chosen by the objective. The
+    models share the coefficients of the loss, unless a coefficient's buffer has shape ``(num_models,)``:
+    one number for each model.
 
     Args:
         model: the model, or a list of models.
@@ -308,6 +310,7 @@ class WindowLoss(LossModule):
             KeyError: if an entry is missing.
             ValueError: if a window is too short, shapes disagree, or a value that counts is not finite.
         """
+        self._check_coeffs()
         data, masks = self._read(tensordict)
         params = self._params()
         if self.num_models is None or self._stackable:
@@ -330,6 +333,18 @@ class WindowLoss(LossModule):
         out = TensorDict(terms, batch_size=[])
         self._clear_weakrefs(tensordict, out, *[f"{name}_params" for name in self._modules_of_model])
         return out
+
+    def _check_coeffs(self) -> None:
+        """A coefficient that is not shared has one entry for each model, and weighs scalars."""
+        own = (self.num_models,) if self.reduction != "none" else ()
+        for name in sorted(self._all_schedulable_buffers):
+            value = getattr(self, name)
+            if value is not None and value.ndim and value.shape != own:
+                raise ValueError(
+                    f"{name} must be a scalar or, for a list of models and reduction='mean' or 'sum', have "
+                    f"one entry for each model, got shape {tuple(value.shape)} for "
+                    f"num_models={self.num_models} and reduction={self.reduction!r}"
+                )
 
     def _watch(self, terms: dict[str, Tensor]) -> None:
         """Called with the terms of all models."""
