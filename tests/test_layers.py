@@ -41,6 +41,7 @@ LAYERS = {
 }
 # Who may import whom within one layer.
 SIDEWAYS = {
+    ("distributions", "stacking"),
     ("statistics", "stacking"),
     ("encoders", "whitening"),
     ("baselines", "models"),

@@ -14,7 +14,7 @@ from torchrl.modules import MLP
 from torchrl_vjepa.distributions import Delta
 from torchrl_vjepa.models import LatentModel
 from torchrl_vjepa.objectives import WindowLoss
-from torchrl_vjepa.stacking import StackableLinear, shared_noise
+from torchrl_vjepa.stacking import StackableLinear, columns, halves, shared_noise, squared_distance
 from torchrl_vjepa.windows import read
 
 __all__ = ["VAE", "PixelAR", "PixelARLoss", "PixelDecoder", "VAELoss"]
@@ -305,13 +305,13 @@ class VAELoss(WindowLoss):
             posterior = self.encoder.module(observation)
         if posterior.dtype in (torch.float16, torch.bfloat16):
             posterior = posterior.float()
-        mean, log_var = posterior.chunk(2, dim=-1)
+        mean, log_var = halves(posterior)
         latent = torch.addcmul(mean, (0.5 * log_var).exp(), shared_noise(mean, 2))
         with decoder_params.to_module(self.decoder):
             decoded = self.decoder.module(latent)
         return {
-            "error": (observation - decoded).square().sum(-1),
-            "kl": 0.5 * ((log_var.exp() + mean.square() - log_var).sum(-1) - mean.shape[-1]),
+            "error": squared_distance(decoded, observation),
+            "kl": 0.5 * (columns(mean).square() + columns(log_var).exp() - columns(log_var) - 1).sum(-2),
         }
 
     def _terms(
@@ -385,13 +385,13 @@ class PixelARLoss(WindowLoss):
         encoder_params, decoder_params = params
         observation = data.get(self.encoder.in_keys[0])
         latent_key, *action_keys = self.decoder.in_keys
-        latent = self._flat(self._encode(data, encoder_params, latent_key)[..., :-1, :])
-        actions = [self._flat(data.get(key)[..., :-1, :]) for key in action_keys]
+        latent = self._flat(self._encode(data, encoder_params, latent_key), slice(-1))
+        actions = [self._flat(data.get(key), slice(-1)) for key in action_keys]
         actions = [action.expand(*latent.shape[:-1], -1) for action in actions]
         with decoder_params.to_module(self.decoder):
             predicted = self.decoder.module(latent, *actions)
-        target = self._flat(observation[..., 1:, :])
-        return {"error": (predicted - target).square().sum(-1)}
+        target = self._flat(observation, slice(1, None))
+        return {"error": squared_distance(predicted, target)}
 
     def _terms(
         self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]

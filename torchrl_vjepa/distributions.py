@@ -23,6 +23,8 @@ from torch.distributions import (
 )
 from torchrl.modules import Delta as _TorchRLDelta
 
+from torchrl_vjepa.stacking import columns
+
 __all__ = ["Delta", "diag_gaussian", "point_estimate", "product_of_experts", "sample", "soft_clamp"]
 
 
@@ -224,14 +226,18 @@ class _DiagGaussian(Independent):
         return self.scale.expand_as(self.loc)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        deviation = value - self.loc
         constant = 0.5 * value.shape[-1] * math.log(2 * math.pi)
-        if self._given.ndim == 1 or (self._given.shape[-2] == 1 and deviation.ndim > 1):
-            # Shared by the rows: one constant for all.
-            quadratic = (deviation.square() * self.precision).sum(-1)
-            return torch.sub(-(constant + 0.5 * self.log_var.sum(-1)), quadratic, alpha=0.5)
-        terms = torch.addcmul(self.log_var, deviation.square(), self.precision)
-        return terms.sum(-1).mul(-0.5).sub_(constant)
+        shared = self._given.ndim == 1 or (self._given.shape[-2] == 1 and self.loc.ndim > 1)
+        # Columns: gradients keep the layout of the latents of a loss (``features_first``).
+        squares = columns(value - self.loc).square()
+        log_var, precision = columns(self.log_var), columns(self.precision)
+        if shared:
+            # One constant for all rows.
+            quadratic = (squares * precision).sum(-2)
+            log_prob = torch.sub(-(constant + 0.5 * log_var.sum(-2)), quadratic, alpha=0.5)
+        else:
+            log_prob = torch.addcmul(log_var, squares, precision).sum(-2).mul(-0.5).sub(constant)
+        return log_prob if value.ndim > 1 or self.loc.ndim > 1 else log_prob.squeeze(-1)
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         shape = (*sample_shape, *self.loc.shape)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.distributions import Independent
 
 from torchrl_vjepa.distributions import Delta, diag_gaussian, soft_clamp
-from torchrl_vjepa.stacking import linear
+from torchrl_vjepa.stacking import halves, linear
 
 __all__ = ["DeltaHead", "DiagGaussianHead", "Head", "TargetScale", "soft_clamp"]
 
@@ -156,7 +156,7 @@ class DiagGaussianHead(Head):
             Diagonal Gaussian with batch ``*B`` and event ``(D,)``.
         """
         if self.scale == "state":
-            loc, log_var = features.chunk(2, dim=-1)
+            loc, log_var = halves(features)
         else:
             loc, log_var = features, constants
         return diag_gaussian(loc, log_var=log_var, log_var_range=self.log_var_range)

@@ -8,7 +8,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["StackableLinear", "features_first", "linear", "products", "shared_noise"]
+__all__ = [
+    "StackableLinear",
+    "columns",
+    "features_first",
+    "halves",
+    "linear",
+    "products",
+    "shared_noise",
+    "squared_distance",
+]
 
 
 class StackableLinear(nn.Linear):
@@ -53,7 +62,7 @@ def shared_noise(like: Tensor, event_dims: int) -> Tensor:
     return torch.randn(dim, *rest, dtype=like.dtype, device=like.device).movedim(0, -1)
 
 
-def features_first(x: Tensor) -> Tensor:
+def features_first(x: Tensor, steps: slice = slice(None)) -> Tensor:
     """Windows as rows, with the values of one feature side by side in memory.
 
     Latents are short vectors in long columns. Sums over features and products with small matrices run
@@ -61,6 +70,7 @@ def features_first(x: Tensor) -> Tensor:
 
     Args:
         x: of shape ``(*N, B, T, D)``.
+        steps: which of the ``T`` steps.
 
     Returns:
         Of shape ``(*N, B T, D)``; a view where the memory is so already.
@@ -70,7 +80,8 @@ def features_first(x: Tensor) -> Tensor:
         >>> features_first(torch.zeros(2, 3, 4)).stride()
         (1, 6)
     """
-    return x.movedim(-1, -3).flatten(-2).mT
+    # Steps are taken after the move: the gradient of a slice has the layout of what was sliced.
+    return x.movedim(-1, -3)[..., steps].flatten(-2).mT
 
 
 def products(x: Tensor) -> Tensor:
@@ -90,6 +101,45 @@ def products(x: Tensor) -> Tensor:
     """
     # torch.matmul reshapes on the way, which small matrices feel.
     return torch.bmm(x.mT, x) if x.ndim == 3 else x.mT @ x
+
+
+def columns(x: Tensor) -> Tensor:
+    """Features before rows; a single row becomes a column.
+
+    Args:
+        x: of shape ``(*N, R, D)``, or ``(D,)``.
+
+    Returns:
+        A view of shape ``(*N, D, R)``, or ``(D, 1)``.
+
+    Examples:
+        >>> import torch
+        >>> columns(torch.zeros(5, 3)).shape, columns(torch.zeros(3)).shape
+        (torch.Size([3, 5]), torch.Size([3, 1]))
+    """
+    return x.mT if x.ndim > 1 else x.unsqueeze(-1)
+
+
+def halves(x: Tensor) -> tuple[Tensor, Tensor]:
+    """The two halves of the features, in the layout of the whole, gradients included.
+
+    Args:
+        x: of shape ``(*B, 2 D)``.
+
+    Returns:
+        Two views of shape ``(*B, D)``.
+
+    Examples:
+        >>> import torch
+        >>> halves(torch.arange(4.0))
+        (tensor([0., 1.]), tensor([2., 3.]))
+    """
+    if x.ndim < 2 or x.stride(-1) == 1:
+        first, second = x.chunk(2, dim=-1)
+        return first, second
+    # The gradient of a chunk is a concatenation, which would put the features last again.
+    first, second = x.mT.chunk(2, dim=-2)
+    return first.mT, second.mT
 
 
 def linear(x: Tensor, weight: Any, bias: Any = None) -> Tensor:
@@ -117,3 +167,21 @@ def linear(x: Tensor, weight: Any, bias: Any = None) -> Tensor:
     # Features first, whatever the input was: see features_first.
     out = (torch.bmm(weight, x.mT) if x.ndim == 3 else weight @ x.mT).mT
     return out if bias is None else out + bias.unsqueeze(-2)
+
+
+def squared_distance(x: Tensor, y: Tensor) -> Tensor:
+    r"""Squared Euclidean distance of rows, :math:`\|x - y\|^2`, in two passes over memory.
+
+    Args:
+        x: of shape ``(*N, R, D)``.
+        y: of the same shape, or ``(R, D)``.
+
+    Returns:
+        Of shape ``(*N, R)``.
+
+    Examples:
+        >>> import torch
+        >>> squared_distance(torch.ones(2, 5, 3), torch.zeros(5, 3))[0]
+        tensor([3., 3., 3., 3., 3.])
+    """
+    return F.mse_loss(columns(x), columns(y.expand_as(x)), reduction="none").sum(-2)

@@ -197,14 +197,14 @@ class LatentPredictionLoss(WindowLoss):
         side_info = data.get(predictor.side_info_key) if predictor.side_info_dim else None
         with named["predictor"].to_module(predictor):
             for skip in predictor.skips:
-                context = self._flat(latent[..., :-skip, :])
+                context = self._flat(latent, slice(-skip))
                 chunks = info = None
                 if action is not None:
                     chunks = _like(context, action_chunks(action, skip).flatten(-4, -3), 2)
                 if side_info is not None:
                     info = _like(context, side_info[..., skip:, :].flatten(-3, -2), 1)
                 p = predictor.dist(context, chunks, skip=skip, side_info=info)
-                pairs = Pairs(skip, p, self._flat(target[..., skip:, :]), context, chunks, info)
+                pairs = Pairs(skip, p, self._flat(target, slice(skip, None)), context, chunks, info)
                 with torch.autocast(latent.device.type, enabled=False):
                     of_pairs = self._pair_outputs(pairs, named)
                 outputs.update({f"{name}_{skip}": value for name, value in of_pairs.items()})

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_vjepa.models import JEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
 from torchrl_vjepa.objectives.pairs import Pairs
+from torchrl_vjepa.stacking import squared_distance
 
 __all__ = ["JEPALoss"]
 
@@ -47,7 +48,7 @@ class JEPALoss(LatentPredictionLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
+            >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_vjepa import JEPA, DeltaHead, Predictor, linear_encoder
         >>> model = JEPA(linear_encoder(20, 4), Predictor(4, action_dim=2, head=DeltaHead()))
@@ -101,7 +102,7 @@ class JEPALoss(LatentPredictionLoss):
         yield from (f"error_skip_{skip}" for skip in self.predictor.skips)
 
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
-        return {"error": (pairs.dist.mean - pairs.target).square().sum(-1)}
+        return {"error": squared_distance(pairs.dist.mean, pairs.target)}
 
     def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
         if self.reduction == "none":

@@ -15,7 +15,7 @@ from torchrl_vjepa.heads import TargetScale
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
 from torchrl_vjepa.objectives.pairs import Pairs, mean_over, rows_of, second_moment
-from torchrl_vjepa.stacking import features_first, shared_noise
+from torchrl_vjepa.stacking import columns, features_first, shared_noise
 from torchrl_vjepa.statistics import covariance_entropy, row_moments
 
 __all__ = ["VJEPALoss"]
@@ -239,8 +239,8 @@ class VJEPALoss(LatentPredictionLoss):
 
     def _scale_divergence(self, outputs: dict[str, Tensor], mask: Tensor | None) -> Tensor:
         r"""Mean over steps of :math:`\sum_d (\sigma_d^2 - 1 - \log \sigma_d^2)`, ``(*N)``."""
-        log_var = self._log_var(outputs)
-        excess = (log_var.exp() - log_var).sum(-1) - log_var.shape[-1]
+        log_var = columns(self._log_var(outputs))
+        excess = (log_var.exp() - log_var).sum(-2) - log_var.shape[-2]
         return excess[..., 0, 0] if excess.shape[-2:] == (1, 1) else mean_over(excess.flatten(-2), mask)
 
     def _target_variance(self, outputs: dict[str, Tensor], mask: Tensor | None) -> Tensor:

@@ -436,9 +436,11 @@ class WindowLoss(LossModule):
                 latent = encoder(data.copy()).get(latent_key)
         return latent.float() if latent.dtype in (torch.float16, torch.bfloat16) else latent
 
-    def _flat(self, windows: Tensor) -> Tensor:
-        """Windows ``(*N, B, T, D)`` as rows ``(*N, B T, D)``."""
-        return features_first(windows) if self._stackable else windows.flatten(-3, -2)
+    def _flat(self, windows: Tensor, steps: slice = slice(None)) -> Tensor:
+        """Windows ``(*N, B, T, D)``, or some of their steps, as rows ``(*N, B T, D)``."""
+        if self._stackable:
+            return features_first(windows, steps)
+        return windows[..., steps, :].flatten(-3, -2)
 
     def _reduce(self, values: list[Tensor], masks: list[Tensor | None], length: int) -> Tensor:
         """Reduce one number for each pair (or step), over pairs and skips, as ``reduction`` says.
