@@ -124,17 +124,18 @@ class CouplingFlow(NoiseDistribution):
     @property
     def mean(self) -> Tensor:
         """Average of the fixed points, ``(*B, D)``."""
-        return self._points().mean(0)
+        return self.loc + self._deviations().mean(0)
 
     @property
     def variance(self) -> Tensor:
         """Variance of the fixed points, ``(*B, D)``."""
-        return self._points().var(0, correction=0)
+        points = self._deviations()
+        return (points - points.mean(0)).square().mean(0)
 
     @property
     def covariance_matrix(self) -> Tensor:
         """Covariance of the fixed points, ``(*B, D, D)``."""
-        points = self._points()
+        points = self._deviations()
         centred = (points - points.mean(0)).movedim(0, -1)
         return centred @ centred.mT / points.shape[0]
 
@@ -176,11 +177,7 @@ class CouplingFlow(NoiseDistribution):
         Returns:
             Latents of shape ``(*S, *B, D)``.
         """
-        value = noise
-        for layer in reversed(self.couplings):
-            value, _ = layer(value, inverse=True)
-        value, _ = spline(value, self.elementwise, inverse=True)
-        return self.loc + self.scale * value
+        return self.loc + self._deviation(noise)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density, in nats.
@@ -218,9 +215,17 @@ class CouplingFlow(NoiseDistribution):
         loc = self.loc.expand(*batch_shape, -1)
         return CouplingFlow(loc, self.scale, self.elementwise, self.couplings, num_points=self.num_points)
 
-    def _points(self) -> Tensor:
+    def _deviation(self, noise: Tensor) -> Tensor:
+        """Draws without the location, whose digits they would lose beside a large one."""
+        for layer in reversed(self.couplings):
+            noise, _ = layer(noise, inverse=True)
+        return self.scale * spline(noise, self.elementwise, inverse=True)[0]
+
+    def _deviations(self) -> Tensor:
+        """Of the fixed points, ``(P, *B, D)``."""
         points = normal_points(self.num_points, self.event_shape[0]).to(self.loc)
-        return self.from_noise(points.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0]))
+        noise = points.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0])
+        return self._deviation(noise).expand(-1, *self.batch_shape, -1)
 
 
 @lru_cache(maxsize=32)
