@@ -146,7 +146,7 @@ class CouplingFlow(NoiseDistribution):
         Its gradient is that of the transform at fixed noise.
         """
         with torch.no_grad():
-            noise, _ = self.to_noise(maximize_log_prob(self)[0])
+            noise, _ = self.to_noise(maximize_log_prob(self, num_steps=50)[0])
         return self.from_noise(noise)
 
     def to_noise(self, value: Tensor) -> tuple[Tensor, Tensor]:
