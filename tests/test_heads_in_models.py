@@ -30,6 +30,7 @@ from torchrl_vjepa import (
     LowRankGaussianHead,
     MixtureHead,
     Predictor,
+    TargetScale,
     VJEPALoss,
     linear_encoder,
     moments,
@@ -97,6 +98,22 @@ def test_the_likelihood_falls_in_training(name: str, residual_variance: Any) -> 
     assert sum(history[-5:]) < sum(history[:5])
     out = model(data[:, 0])
     assert out["loc"].shape == out["scale"].shape == (4, LATENT)
+
+
+def test_members_of_an_ensemble_train_by_their_own_likelihoods() -> None:
+    predictor = Predictor(LATENT, ACTION, head=HEADS["ensemble"]())
+    scale = TargetScale(LATENT, kind="constant", init_std=1e-3)
+    model = VJEPA(linear_encoder(OBS, LATENT), predictor, target_scale=scale)
+    data = windows()
+    with torch.no_grad():
+        z = model.encoder(data.clone())["latent"]
+        p = predictor.dist(z[:, :-1], data["action"][:, :-1])
+        own, mixed = log_score(p, z[:, 1:]).mean(), p.log_prob(z[:, 1:]).mean()
+    for residual_variance in ("head", "batch"):
+        loss = VJEPALoss(model, residual_variance=residual_variance)
+        SoftUpdate(loss, eps=0.99)
+        found = -loss(data)["nll_skip_1"]
+        assert abs(float(found - own)) < 0.1 * float(mixed - own)
 
 
 @EVERY
