@@ -181,7 +181,7 @@ class Predictor(_Transition):
                     )
                 ]
             )
-        self.constants = nn.Parameter(torch.zeros(len(skips), self.head.num_constants(latent_dim)))
+        self.constants = nn.Parameter(self._init_constants())
         self.latent_key, self.action_key, self.side_info_key = latent_key, action_key, side_info_key
         self.in_keys = [latent_key]
         if action_dim:
@@ -191,9 +191,12 @@ class Predictor(_Transition):
         self.out_keys = [out_key]
 
     def reset_parameters(self) -> None:
-        """Set the constants of the head back to zero (the trunks reset themselves)."""
+        """New constants of the head (the trunks reset themselves)."""
         with torch.no_grad():
-            self.constants.zero_()
+            self.constants.copy_(self._init_constants())
+
+    def _init_constants(self) -> Tensor:
+        return torch.stack([self.head.init_constants(self.latent_dim) for _ in self.skips])
 
     def _reset_parameters(self, module: nn.Module) -> bool:
         # reset_parameters_recursive visits the children only, not the module that it is called on.
@@ -289,10 +292,12 @@ class FusedPredictor(_Transition):
     r"""Hard fusion of the dynamics with a prior by product of experts (``eq:bjepa_posterior``).
 
     :math:`p(Z_T \mid Z_C, \eta) \propto p_{\text{like}}(Z_T \mid Z_C)\, p_{\text{prior}}(Z_T \mid \eta)`,
-    in closed form for Gaussians. It is again a transition, with the attributes of the predictor.
+    in closed form for Gaussians, also of mixtures of them. It is again a transition, with the attributes
+    of the predictor.
 
     Args:
-        predictor: the likelihood expert :math:`p_{\text{like}}`, with a Gaussian head.
+        predictor: the likelihood expert :math:`p_{\text{like}}`, with a head that is Gaussian, a mixture
+            or an ensemble of Gaussians.
         prior: the prior expert: a callable that returns a Gaussian over latents, for instance a
             :class:`~torchrl_vjepa.priors.GaussianPrior`. ``None`` is the flat prior: the predictor's own
             distribution.

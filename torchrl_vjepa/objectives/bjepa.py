@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
-from torch.distributions import Distribution, Independent, MultivariateNormal, kl_divergence
 
+from torchrl_vjepa.distributions import kl_divergence
 from torchrl_vjepa.models import BJEPA
 from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.objectives.vjepa import VJEPALoss
@@ -34,10 +33,14 @@ class BJEPALoss(VJEPALoss):
     Args:
         model: the model, or a list of models that train as one batch.
         structural_kl_coeff: :math:`\gamma`.
+        num_kl_samples: draws of the unbiased estimate of the divergence where there is no closed form
+            (mixtures, ensembles and flows; see
+            :func:`~torchrl_vjepa.distributions.monte_carlo_kl`), at least 2.
         **kwargs: see :class:`VJEPALoss`.
 
     Raises:
-        ValueError: if a coefficient is negative or not finite, or an option is unknown.
+        ValueError: if a coefficient is negative or not finite, ``num_kl_samples`` is below 2, or an option
+            is unknown.
 
     Examples:
         >>> import torch
@@ -60,9 +63,17 @@ class BJEPALoss(VJEPALoss):
     _parts = {**VJEPALoss._parts, "prior": "structural_prior_module"}
 
     def __init__(
-        self, model: BJEPA | Sequence[BJEPA], *, structural_kl_coeff: float = 0.1, **kwargs: Any
+        self,
+        model: BJEPA | Sequence[BJEPA],
+        *,
+        structural_kl_coeff: float = 0.1,
+        num_kl_samples: int = 8,
+        **kwargs: Any,
     ) -> None:
+        if num_kl_samples < 2:
+            raise ValueError(f"num_kl_samples must be at least 2, got {num_kl_samples}")
         super().__init__(model, **kwargs)
+        self.num_kl_samples = int(num_kl_samples)
         self._register_coeff("structural_kl_coeff", structural_kl_coeff)
 
     def _loss_keys(self) -> Iterator[str]:
@@ -76,7 +87,9 @@ class BJEPALoss(VJEPALoss):
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
         outputs = super()._pair_outputs(pairs, params)
         with params["prior"].to_module(self.prior):
-            outputs["structural"] = _kl(pairs.dist, self.prior.module())
+            outputs["structural"] = kl_divergence(
+                pairs.dist, self.prior.module(), num_samples=self.num_kl_samples
+            )
         return outputs
 
     def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -90,10 +103,3 @@ class BJEPALoss(VJEPALoss):
                 terms["structural_kl"] = self._over_skips(means).detach()
         terms["loss_structural_kl"] = self.structural_kl_coeff * structural
         return terms
-
-
-def _kl(p: Distribution, prior: Distribution) -> Tensor:
-    if isinstance(prior, MultivariateNormal) and isinstance(p, Independent):
-        # torch has no divergence between a diagonal and a full Gaussian.
-        p = MultivariateNormal(p.mean, scale_tril=torch.diag_embed(p.stddev), validate_args=False)
-    return kl_divergence(p, prior.expand(p.batch_shape))

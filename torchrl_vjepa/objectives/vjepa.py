@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
+from torchrl_vjepa.distributions import log_score
 from torchrl_vjepa.heads import TargetScale
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
@@ -51,7 +52,8 @@ class VJEPALoss(LatentPredictionLoss):
         target_kl_coeff: :math:`\beta`.
         target_scale_gradient: what moves the scale of the target: ``"kl"``: the KL term alone (the
             paper's training section); ``"both"``: the likelihood too; ``"none"``: it stays as it is.
-        residual_variance: ``"head"``: the likelihood is the head's, as printed; ``"batch"``: the
+        residual_variance: ``"head"``: the likelihood is the head's, as printed (an ensemble's members
+            each have their own, :func:`~torchrl_vjepa.distributions.log_score`); ``"batch"``: the
             representation and the mean are trained by the likelihood at the residual covariance that is
             optimal for the batch, in closed form, :math:`\hat\Sigma = \mathbb E\, r r^\top` with
             :math:`r = Z_T - \mu_\phi`, and the head by its own likelihood on detached latents
@@ -171,14 +173,14 @@ class VJEPALoss(LatentPredictionLoss):
 
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
         if self.residual_variance == "head":
-            return {"nll": -pairs.dist.log_prob(pairs.target)}
+            return {"nll": -log_score(pairs.dist, pairs.target)}
         # The head's own likelihood moves the predictor alone.
         p = self.predictor.dist(
             pairs.context.detach(), pairs.action, skip=pairs.skip, side_info=pairs.side_info
         )
         return {
             "residual": pairs.dist.mean - pairs.target,
-            "nll": -p.log_prob(pairs.target.detach()),
+            "nll": -log_score(p, pairs.target.detach()),
         }
 
     def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
