@@ -2,7 +2,7 @@
 
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import rollout
-from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
+from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
 from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
@@ -28,6 +28,7 @@ from torchrl_vjepa.objectives import (
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
+from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.whitening import Whitening
 
@@ -36,6 +37,7 @@ __all__ = [
     "BJEPALoss",
     "BatchedNoisyTVEnv",
     "CEM",
+    "ChanceConstraint",
     "CollapseWarning",
     "Cost",
     "Delta",
@@ -73,13 +75,16 @@ __all__ = [
     "Whitening",
     "WindowLoss",
     "action_cost",
+    "cvar",
     "diag_gaussian",
     "effective_rank",
+    "entropic",
     "expectation",
     "gaussian_entropy",
     "history_encoder",
     "linear_encoder",
     "linear_probe",
+    "mean_variance",
     "mlp_encoder",
     "mutual_information_bound",
     "point_estimate",
@@ -88,4 +93,5 @@ __all__ = [
     "rollout",
     "sample",
     "sliced_gaussian_distance",
+    "worst_case",
 ]
