@@ -95,10 +95,10 @@ class Settings:
 
 QUICK = {
     "frames": 4_000,
-    "train_steps": 150,
-    "num_candidates": 24,
-    "num_samples": 24,
-    "episodes": 20,
+    "train_steps": 100,
+    "num_candidates": 16,
+    "num_samples": 20,
+    "episodes": 10,
     "optim_steps": 2,
 }
 
