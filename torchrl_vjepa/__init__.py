@@ -2,7 +2,7 @@
 
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import rollout
-from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
+from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
 from torchrl_vjepa.distributions import (
     CouplingFlow,
@@ -58,6 +58,7 @@ from torchrl_vjepa.objectives import (
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
+from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.whitening import Whitening
 
@@ -67,6 +68,7 @@ __all__ = [
     "BJEPALoss",
     "BatchedNoisyTVEnv",
     "CEM",
+    "ChanceConstraint",
     "CollapseWarning",
     "Cost",
     "CouplingFlow",
@@ -114,8 +116,10 @@ __all__ = [
     "Whitening",
     "WindowLoss",
     "action_cost",
+    "cvar",
     "diag_gaussian",
     "effective_rank",
+    "entropic",
     "entropy_bounds",
     "expectation",
     "full_gaussian",
@@ -125,6 +129,7 @@ __all__ = [
     "linear_encoder",
     "linear_probe",
     "maximize_log_prob",
+    "mean_variance",
     "mlp_encoder",
     "moments",
     "monte_carlo_entropy",
@@ -137,4 +142,5 @@ __all__ = [
     "sample",
     "select_best",
     "sliced_gaussian_distance",
+    "worst_case",
 ]
