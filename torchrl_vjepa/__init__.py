@@ -1,7 +1,17 @@
 """Probabilistic joint-embedding world models, their losses, environments and planners, for TorchRL."""
 
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
-from torchrl_vjepa.belief import rollout
+from torchrl_vjepa.belief import (
+    ParticleBelief,
+    ParticleFilter,
+    PseudoLikelihood,
+    composition_gap,
+    effective_sample_size,
+    propagate_moments,
+    rollout,
+    surprise,
+    systematic_resampling,
+)
 from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
 from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
@@ -56,12 +66,15 @@ __all__ = [
     "LinearProbe",
     "MPPI",
     "NoisyTVEnv",
+    "ParticleBelief",
+    "ParticleFilter",
     "PixelAR",
     "PixelARLoss",
     "PixelDecoder",
     "Planner",
     "Predictor",
     "Proposal",
+    "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",
     "RewardLoss",
@@ -73,8 +86,10 @@ __all__ = [
     "Whitening",
     "WindowLoss",
     "action_cost",
+    "composition_gap",
     "diag_gaussian",
     "effective_rank",
+    "effective_sample_size",
     "expectation",
     "gaussian_entropy",
     "history_encoder",
@@ -84,8 +99,11 @@ __all__ = [
     "mutual_information_bound",
     "point_estimate",
     "product_of_experts",
+    "propagate_moments",
     "quadratic_cost",
     "rollout",
     "sample",
     "sliced_gaussian_distance",
+    "surprise",
+    "systematic_resampling",
 ]

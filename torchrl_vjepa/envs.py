@@ -18,9 +18,10 @@ from torch.distributions import Distribution, Independent, Normal
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
-from torchrl_vjepa.belief import Transition, rollout
+from torchrl_vjepa.belief import Transition, rollout, systematic_resampling
 from torchrl_vjepa.costs import Risk, StageCost, expectation
 from torchrl_vjepa.distributions import Delta, point_estimate, sample
+from torchrl_vjepa.generators import pack_generator, unpack_generator
 
 __all__ = ["LatentEnv"]
 
@@ -47,13 +48,16 @@ class LatentEnv(ModelBasedEnvBase):
             ``(*B, 1)``. Either this or ``cost``.
         cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; the reward is minus the cost.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
-        num_samples: trajectories ``M`` per candidate plan for ``how="sample"``. They share their
-            random numbers across candidates and across the batch for diagonal Gaussian predictions
-            (common random numbers: the ranking of plans does not depend on luck); other
-            distributions are sampled independently.
+        num_samples: trajectories ``M`` per candidate plan for ``how="sample"``, or from ``M`` particles
+            of a belief with any ``how``. They share their random numbers across candidates and across
+            the batch for diagonal Gaussian predictions (common random numbers: the ranking of plans
+            does not depend on luck); other distributions are sampled independently.
         risk: ``(costs (M, *B)) -> (*B)``, applied to the summed costs of the ``M`` trajectories.
         latent_dim: size ``D``; needed only if the model does not tell.
         latent_key: where the latent is; by default the model's, else ``"latent"``.
+        belief_key: where a belief is, ``("next", "belief")`` behind a
+            :class:`~torchrl_vjepa.belief.ParticleFilter`: planning then starts from ``num_samples`` of
+            its particles, the same for all candidates, instead of from the latent.
         action_key: where the action is; by default the model's, else ``"action"``.
         reward_key: where the reward is written.
         device: by default the one of the model's parameters.
@@ -97,6 +101,7 @@ class LatentEnv(ModelBasedEnvBase):
         risk: Risk = expectation,
         latent_dim: int | None = None,
         latent_key: NestedKey | None = None,
+        belief_key: NestedKey | None = None,
         action_key: NestedKey | None = None,
         reward_key: NestedKey = "reward",
         device: torch.device | str | None = None,
@@ -109,10 +114,10 @@ class LatentEnv(ModelBasedEnvBase):
             )
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
-        if num_samples < 1 or (num_samples > 1 and how != "sample"):
+        if num_samples < 1 or (num_samples > 1 and how != "sample" and belief_key is None):
             raise ValueError(
                 "num_samples must be at least 1, and 1 unless how='sample', "
-                f"got {num_samples} with how={how!r}"
+                f"got {num_samples} with how={how!r} and no belief_key"
             )
         predictor = getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
@@ -149,6 +154,10 @@ class LatentEnv(ModelBasedEnvBase):
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
         self.latent_dim, self.action_dim = latent_dim, action_dim
         self.latent_key = unravel_key(latent_key)
+        self.planning_keys = [self.latent_key]
+        self.belief_key = None if belief_key is None else unravel_key(belief_key)
+        if belief_key is not None:
+            self.planning_keys = [unravel_key((belief_key, name)) for name in ("particles", "log_weights")]
         self.how, self.num_samples, self.risk = how, num_samples, risk
         self.rng: torch.Generator | None = None
         latent_spec = Unbounded((latent_dim,), device=self.device, dtype=dtype)
@@ -163,42 +172,55 @@ class LatentEnv(ModelBasedEnvBase):
         )
         world_model.probe(latent_dim, action_dim, self.device, dtype)
 
-    def planning_state(self, tensordict: TensorDictBase) -> Tensor:
-        """Where imagination starts: the latent, and nothing else of the input.
+    def planning_state(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
+        """Where imagination starts: the latent or the belief, and nothing else of the input.
 
         Args:
-            tensordict: holds the latent.
+            tensordict: holds the latent, or the belief if there is a ``belief_key``.
 
         Returns:
-            Latent of shape ``(*B, D)``.
+            Latent of shape ``(*B, D)``; or a tensordict of batch size ``*B`` with ``particles
+            (K, D)`` and ``log_weights (K)``.
 
         Raises:
-            KeyError: if there is no latent.
+            KeyError: if an entry is missing.
             ValueError: if its last dimension is not ``D``.
         """
-        latent = tensordict.get(self.latent_key, None)
-        if latent is None:
-            raise KeyError(
-                f"planning needs the entry {self.latent_key!r}, got a tensordict with "
-                f"{sorted(map(str, tensordict.keys(True, True)))}; put the encoder in front"
-            )
-        if latent.shape[-1:] != (self.latent_dim,):
+        values = [tensordict.get(key, None) for key in self.planning_keys]
+        for key, value in zip(self.planning_keys, values, strict=True):
+            if value is None:
+                raise KeyError(
+                    f"planning needs the entry {key!r}, got a tensordict with "
+                    f"{sorted(map(str, tensordict.keys(True, True)))}; put the "
+                    f"{'encoder' if self.belief_key is None else 'particle filter'} in front"
+                )
+        start = values[0]
+        if start.shape[-1:] != (self.latent_dim,):
+            lead = "(*B" if self.belief_key is None else "(*B, K"
             raise ValueError(
-                f"{self.latent_key!r} must have shape (*B, {self.latent_dim}), got {tuple(latent.shape)}"
+                f"{self.planning_keys[0]!r} must have shape {lead}, {self.latent_dim}), "
+                f"got {tuple(start.shape)}"
             )
-        return latent
+        if self.belief_key is None:
+            return start
+        names = ("particles", "log_weights")
+        return TensorDict(dict(zip(names, values, strict=True)), batch_size=start.shape[:-2])
 
     def objective(
-        self, state: Tensor, actions: Tensor, *, generator: torch.Generator | None = None
+        self,
+        state: Tensor | TensorDictBase,
+        actions: Tensor,
+        *,
+        generator: torch.Generator | None = None,
     ) -> Tensor:
         r"""Cost of candidate plans, :math:`\sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k})`.
 
         Gradients flow to ``actions`` if they require them.
 
         Args:
-            state: latents to start from, of shape ``(*B, D)``.
+            state: what :meth:`planning_state` gives: latents of shape ``(*B, D)``, or a belief.
             actions: candidate plans, of shape ``(*B, N, H, A)``.
-            generator: source of randomness for ``how="sample"``.
+            generator: source of randomness for ``how="sample"`` and for the particles of a belief.
 
         Returns:
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
@@ -207,20 +229,27 @@ class LatentEnv(ModelBasedEnvBase):
             ValueError: if a shape does not fit.
         """
         batch, (num_candidates, _, action_dim) = actions.shape[:-3], actions.shape[-3:]
-        if state.shape != (*batch, self.latent_dim) or action_dim != self.action_dim:
+        belief = not isinstance(state, Tensor)
+        start = _drawn(state, self.num_samples, generator) if belief else state
+        expected = (*batch, self.latent_dim)
+        if start.shape[belief:] != expected or action_dim != self.action_dim:
             raise ValueError(
                 f"state and actions must have shapes (*B, {self.latent_dim}) and (*B, N, H, "
-                f"{self.action_dim}), got {tuple(state.shape)} and {tuple(actions.shape)}"
+                f"{self.action_dim}), got {tuple(start.shape[belief:])} and {tuple(actions.shape)}"
             )
-        actions = actions.to(state.dtype)
-        start = state.unsqueeze(-2).expand(*batch, num_candidates, self.latent_dim)
+        actions = actions.to(start.dtype)
         model = self.world_model
-        if self.how != "sample":
+        if not belief and self.how == "sample":
+            start = start.expand(self.num_samples, *start.shape)
+        start = start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim)
+        if not belief and self.how != "sample":
             latents = rollout(model.transition, start, actions, self.how)
             return model.stage_cost(latents, actions).sum(dim=-1)
-        start = start.expand(self.num_samples, *start.shape)
         actions = actions.expand(self.num_samples, *actions.shape)
-        latents = rollout(_SharedNoise(model.transition, generator), start, actions, "mean")
+        if self.how == "sample":
+            latents = rollout(_SharedNoise(model.transition, generator), start, actions, "mean")
+        else:
+            latents = rollout(model.transition, start, actions, self.how)
         costs = self.risk(model.stage_cost(latents, actions).sum(dim=-1))
         return _checked_shape(costs, (*batch, num_candidates), "risk")
 
@@ -269,36 +298,6 @@ class LatentEnv(ModelBasedEnvBase):
     def __setstate__(self, state: dict[str, Any]) -> None:
         rng = state["rng"]
         super().__setstate__({**state, "rng": None if rng is None else unpack_generator(rng)})
-
-
-def pack_generator(generator: torch.Generator) -> tuple[str, bytes]:
-    """Device and state of a generator, in a form that survives every way of pickling.
-
-    ``torch.Generator`` pickles its state as a temporary tensor, whose file descriptor is closed too
-    early when a process is spawned.
-
-    Args:
-        generator: the generator.
-
-    Returns:
-        Name of its device, and its state.
-    """
-    return str(generator.device), generator.get_state().numpy().tobytes()
-
-
-def unpack_generator(packed: tuple[str, bytes]) -> torch.Generator:
-    """The inverse of :func:`pack_generator`.
-
-    Args:
-        packed: device and state.
-
-    Returns:
-        A generator that continues where the packed one was.
-    """
-    device, state = packed
-    generator = torch.Generator(device)
-    generator.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
-    return generator
 
 
 class _LatentStep(TensorDictModuleBase):
@@ -448,6 +447,15 @@ class _SharedNoise:
         shape = (loc.shape[0], *[1] * (loc.ndim - 2), loc.shape[-1])
         noise = torch.randn(shape, generator=self.generator, device=loc.device, dtype=loc.dtype)
         return Delta(loc + scale * noise)
+
+
+def _drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:
+    """Particles ``(M, *B, D)`` of a belief, by one random number for all rows, as all planning noise."""
+    index = systematic_resampling(
+        belief.get("log_weights"), num_samples, shared=True, generator=generator
+    ).unsqueeze(-1)
+    particles = belief.get("particles")
+    return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
 
 
 def _first(*values: Any) -> Any:
