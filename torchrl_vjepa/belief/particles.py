@@ -29,7 +29,7 @@ def effective_sample_size(log_weights: Tensor) -> Tensor:
     Examples:
         >>> import torch
         >>> effective_sample_size(torch.tensor([[0.0, 0.0, 0.0], [5.0, -torch.inf, -torch.inf]]))
-        tensor([3.0000, 1.0000])
+        tensor([3., 1.])
     """
     _check_particles(log_weights, "log_weights")
     return (2 * log_weights.logsumexp(-1) - (2 * log_weights).logsumexp(-1)).exp()
@@ -94,7 +94,7 @@ class ParticleBelief(Distribution):
     Args:
         particles: :math:`Z^{(k)}`, of shape ``(*B, K, D)``, ``K`` of at least 1.
         log_weights: :math:`\log w^{(k)}`, of shape ``(*B, K)``, normalised here; equal by default.
-        validate_args: whether values are looked at; as in ``torch.distributions``, yes by default.
+        validate_args: whether values are looked at.
 
     Raises:
         ValueError: if a shape is wrong, there is no particle, or (validated) a particle is not finite,
@@ -112,7 +112,7 @@ class ParticleBelief(Distribution):
     arg_constraints: dict[str, constraints.Constraint] = {}
 
     def __init__(
-        self, particles: Tensor, log_weights: Tensor | None = None, validate_args: bool | None = None
+        self, particles: Tensor, log_weights: Tensor | None = None, validate_args: bool = True
     ) -> None:
         if particles.ndim < 2 or not particles.shape[-2]:
             raise ValueError(
@@ -126,7 +126,7 @@ class ParticleBelief(Distribution):
                 f"{tuple(particles.shape)}, got {tuple(log_weights.shape)}"
             )
         super().__init__(particles.shape[:-2], particles.shape[-1:], validate_args=validate_args)
-        if self._validate_args:
+        if validate_args:  # TorchRL turns the default of torch.distributions off
             _check_values(particles, log_weights)
         self.particles = particles
         self.log_weights = log_weights.log_softmax(-1)
