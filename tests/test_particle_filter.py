@@ -64,7 +64,7 @@ def problem() -> KalmanSystem:
 
 def test_mean_and_evidence_are_those_of_the_kalman_filter(problem: KalmanSystem) -> None:
     """Within 5 % of the Kalman filter's squared error, evidence within its standard error; K = 1000."""
-    rows, steps, repeats = 12, 30, 12
+    rows, steps, repeats = 50, 30, 5
     data = problem.simulate(rows, steps)
     exact = problem.kalman.filter(data["observation"], data["action"])
     observations, actions = (data[key].expand(repeats, -1, -1, -1) for key in ("observation", "action"))
@@ -180,7 +180,7 @@ def test_nonlinear_filter_against_a_grid() -> None:
         (out["log_evidence"], evidences),
     ):
         error = values.std(0) / repeats**0.5
-        assert (error < 0.05).all()
+        assert (error < 0.1).all()
         assert ((values.mean(0) - torch.stack(exact, 1)).abs() < 5 * error).all()
     assert max(variances[-1]) > 1.0  # two modes
 

@@ -393,21 +393,30 @@ class ParticleFilter(TensorDictModuleBase):
                 f"ParticleFilter needs the entries {missing} to go on from a belief: append "
                 "torchrl.modules.get_env_transforms_from_module(filter) to the environment"
             )
-        is_init = tensordict.get(init_key).reshape(self._batch(observation))
-        if bool(is_init.all()):
-            return self.start(observation)
+        is_init = tensordict.get(init_key).reshape(self._batch(observation)).bool()
         particles, log_weights, action = (tensordict.get(key) for key in memory)
-        before = ParticleBelief(particles, log_weights, validate_args=False)
-        belief, log_evidence = self.step(before, action, observation)
         if not bool(is_init.any()):
-            return belief, log_evidence
-        fresh, fresh_evidence = self.start(observation)
-        belief = ParticleBelief(
-            torch.where(is_init[..., None, None], fresh.particles, belief.particles),
-            torch.where(is_init[..., None], fresh.log_weights, belief.log_weights),
-            validate_args=False,
+            before = ParticleBelief(particles, log_weights, validate_args=False)
+            return self.step(before, action, observation)
+        fresh, evidence = self.start(observation[is_init])
+        particles, log_weights = particles.clone(), log_weights.clone()
+        log_evidence = evidence.new_empty(is_init.shape)
+        particles[is_init], log_weights[is_init], log_evidence[is_init] = (
+            fresh.particles,
+            fresh.log_weights,
+            evidence,
         )
-        return belief, torch.where(is_init, fresh_evidence, log_evidence)
+        # Only the rows that go on are moved: what a row held that begins anew must not even warn.
+        goes_on = ~is_init
+        if bool(goes_on.any()):
+            before = ParticleBelief(particles[goes_on], log_weights[goes_on], validate_args=False)
+            moved, evidence = self.step(before, action[goes_on], observation[goes_on])
+            particles[goes_on], log_weights[goes_on], log_evidence[goes_on] = (
+                moved.particles,
+                moved.log_weights,
+                evidence,
+            )
+        return ParticleBelief(particles, log_weights, validate_args=False), log_evidence
 
     def _batch(self, observation: Tensor) -> torch.Size:
         if observation.ndim < self.observation_ndim:
