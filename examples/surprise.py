@@ -289,9 +289,9 @@ def figure(rows: Sequence[Row], curves: dict[tuple[str, str], Tensor], path: Pat
             style = STYLES[name]
             panel.plot(steps, middle, label=label, **style)
             panel.fill_between(steps, low, high, color=style["color"], alpha=0.2, lw=0)
-        panel.set_title(f"After step 100 {what}")
+        panel.set_title(what)
         panel.set_yscale("symlog", linthresh=1)
-        panel.set_ylim(0, 3e3)
+        panel.set_ylim(0, 1e4)
         panel.margins(x=0)
     for panel in (*panels[1, :-1], panels[0, -1]):
         panel.set_xlabel("time (steps)")
@@ -300,7 +300,7 @@ def figure(rows: Sequence[Row], curves: dict[tuple[str, str], Tensor], path: Pat
         panel.set_ylabel("CUSUM of the surprise\n(in thresholds)")
     handles = panels[0, 0].get_legend_handles_labels()
     fig.legend(*handles, loc="outside lower center", ncols=3, frameon=False)
-    fig.suptitle(f"One system, seed {rows[0]['seed']}: median and 90 % of the episodes", fontsize=10)
+    fig.suptitle(f"What changes at step {CHANGE} (median and 90 % of the episodes, seed {rows[0]['seed']})")
     fig.savefig(path, dpi=150)
     plt.close(fig)
 

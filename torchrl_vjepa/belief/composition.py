@@ -23,7 +23,7 @@ def composition_gap(
     *,
     step: int = 1,
     divergence: Literal["wasserstein", "kl"] = "wasserstein",
-    method: Literal["linearize", "sigma_points"] = "linearize",
+    method: Literal["sigma_points", "linearize"] = "sigma_points",
 ) -> Tensor:
     r"""How far a direct skip prediction is from iterated short predictions.
 

@@ -24,7 +24,7 @@ def propagate_moments(
     transition: Transition,
     latent: Tensor,
     actions: Tensor,
-    method: Literal["linearize", "sigma_points"] = "linearize",
+    method: Literal["sigma_points", "linearize"] = "sigma_points",
     *,
     covariance: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -37,13 +37,14 @@ def propagate_moments(
     over :math:`Z_t \sim \mathcal N(\mu_t, P_t)`. Both methods are exact for a linear-Gaussian
     transition, where this is the Kalman prediction ``eq:kf_mean_update``, ``eq:kf_cov_update``:
 
-    - ``"linearize"`` expands around the mean: :math:`\mu_\phi(\mu_t)` and
-      :math:`\Sigma_\phi(\mu_t) + J P_t J^\top` with :math:`J = \partial \mu_\phi / \partial Z` (the
-      extended Kalman prediction). The mean has to be differentiable in the latent.
     - ``"sigma_points"`` averages over the :math:`2 D` points
       :math:`\mu_t \pm \sqrt D\, L_i`, :math:`L L^\top = P_t`, with equal weights (the spherical cubature
-      rule): exact where :math:`\mu_\phi` is a polynomial of third degree, as far as the mean goes; no
+      rule): the mean and :math:`\mathbb E[\Sigma_\phi]` are exact for polynomials of third degree; no
       derivative is needed, and no weight is negative, so :math:`P` stays a covariance.
+    - ``"linearize"`` expands around the mean: :math:`\mu_\phi(\mu_t)` and
+      :math:`\Sigma_\phi(\mu_t) + J P_t J^\top` with :math:`J = \partial \mu_\phi / \partial Z` (the
+      extended Kalman prediction). The mean has to be differentiable in the latent; a Jacobian costs about
+      as much as the sigma points.
 
     Neither sees that a belief becomes multi-modal or skewed; :func:`rollout` with ``how="sample"``
     does, for any distribution.
