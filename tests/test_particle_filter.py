@@ -15,6 +15,9 @@ from torch.distributions import Distribution, Independent, MultivariateNormal, N
 
 from torchrl_vjepa.belief import ParticleBelief, ParticleFilter, PseudoLikelihood
 from torchrl_vjepa.distributions import Delta, diag_gaussian, product_of_experts
+from torchrl_vjepa.encoders import linear_encoder
+from torchrl_vjepa.heads import TargetScale
+from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.noisy_tv import KalmanFilter, LinearGaussianSystem
 from torchrl_vjepa.predictor import Predictor
 from torchrl_vjepa.priors import GaussianPrior
@@ -209,6 +212,32 @@ def test_pseudo_likelihood_is_the_ratio(reference: Any) -> None:
         torch.testing.assert_close(value[row], q.log_prob(latent[row]) - p.log_prob(latent[row]))
 
 
+def test_the_target_of_a_vjepa() -> None:
+    """q_theta'(z | x) around its own encoding, with a scale that depends on the observation."""
+    scale = TargetScale(4, 20, kind="linear")
+    model = VJEPA(linear_encoder(20, 4), Predictor(4, action_dim=2), target_scale=scale)
+
+    def target(observation: Tensor) -> Distribution:
+        return model.target_dist(model.encoder.module(observation), observation)
+
+    run = ParticleFilter(
+        model,
+        PseudoLikelihood(target),
+        num_particles=4000,
+        proposal=lambda p, x: target(x).expand(p.batch_shape),
+        generator=torch.Generator().manual_seed(0),
+    )
+    observations = torch.randn(3, 5, 20)
+    with torch.no_grad():
+        first = run.filter(observations[:, :1], torch.zeros(3, 1, 2))
+        q = target(observations[:, 0])
+    # The initial prior is the reference: the first belief is q itself, with equal weights.
+    torch.testing.assert_close(first["effective_sample_size"], torch.full((3, 1), 4000.0))
+    assert ((first["mean"][:, 0] - q.mean).abs() < 5 * q.stddev / 4000**0.5).all()
+    with torch.no_grad():
+        assert run.filter(observations, torch.randn(3, 5, 2))["mean"].isfinite().all()
+
+
 @pytest.mark.parametrize("proposal", [None, lambda p, x: product_of_experts(p, measured(x))])
 def test_option_b_is_the_product_of_the_gaussians(proposal: Any) -> None:
     """N(prediction) times q / p_ref, in closed form."""
@@ -374,8 +403,9 @@ def test_images_and_modules() -> None:
     assert names == {"predictor", "likelihood"}
     out = run.filter(torch.randn(5, 7, 3, 2, 2), torch.randn(5, 7, 2))
     assert out["mean"].shape == (5, 7, 4)
-    double = run.double()
-    double.dtype = torch.float64
+    out = run.double().filter(torch.randn(5, 7, 3, 2, 2).double(), torch.randn(5, 7, 2).double())
+    assert out["mean"].dtype == torch.float64
+    assert run.make_tensordict_primer().primers["belief", "particles"].dtype == torch.float64
 
 
 def test_randomness_is_the_generators(problem: KalmanSystem) -> None:

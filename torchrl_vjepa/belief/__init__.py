@@ -2,8 +2,9 @@
 
 from torchrl_vjepa.belief.composition import composition_gap
 from torchrl_vjepa.belief.moments import propagate_moments
-from torchrl_vjepa.belief.particle_filter import ParticleFilter, PseudoLikelihood
+from torchrl_vjepa.belief.particle_filter import ParticleFilter
 from torchrl_vjepa.belief.particles import ParticleBelief, effective_sample_size, systematic_resampling
+from torchrl_vjepa.belief.pseudo_likelihood import PseudoLikelihood
 from torchrl_vjepa.belief.rollouts import Transition, rollout
 from torchrl_vjepa.belief.surprisal import surprise
 

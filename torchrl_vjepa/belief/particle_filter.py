@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
@@ -23,54 +23,10 @@ from torchrl_vjepa.belief.particles import (
 from torchrl_vjepa.distributions import diag_gaussian, sample
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 
-__all__ = ["ParticleFilter", "PseudoLikelihood"]
+__all__ = ["ParticleFilter"]
 
 Likelihood = Callable[[Tensor, Tensor], Tensor]
 Proposal = Callable[[Distribution, Tensor], Distribution]
-
-
-class PseudoLikelihood(nn.Module):
-    r"""Option B of the particle filter: a likelihood from the target distribution, without a decoder.
-
-    .. math::
-        \log \tilde p(x \mid Z) = \log q_{\theta'}(Z \mid x) - \log p_{\text{ref}}(Z)
-
-    Bayes' rule, with the target encoder in place of the posterior :math:`p(Z \mid x)` and the reference
-    prior in place of :math:`p(Z)` (section "Option B: Latent-Space Update").
-
-    Args:
-        target: :math:`q_{\theta'}`: ``observation (*B, 1, O) -> Distribution``, batch ``(*B, 1)`` and event
-            ``(D,)``; for a ``VJEPA`` ``lambda x: model.target_dist(model.encoder.module(x), x)``.
-        reference_prior: :math:`p_{\text{ref}}`: anything with ``log_prob(latent)``; by default
-            :math:`\mathcal N(0, I)`, as in the KL term of ``eq:vjepa_objective``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_vjepa.distributions import diag_gaussian
-        >>> likelihood = PseudoLikelihood(lambda x: diag_gaussian(x, torch.full_like(x, 0.5)))
-        >>> likelihood(torch.zeros(1, 2), torch.zeros(3, 2))  # log of N(0; 0, 0.25 I) / N(0; 0, I)
-        tensor([1.3863, 1.3863, 1.3863])
-    """
-
-    def __init__(self, target: Callable[[Tensor], Distribution], reference_prior: Any = None) -> None:
-        super().__init__()
-        self.target = target
-        self.reference_prior = reference_prior
-
-    def forward(self, observation: Tensor, latent: Tensor) -> Tensor:
-        """The log-ratio.
-
-        Args:
-            observation: of shape ``(*B, 1, *O)``.
-            latent: particles, of shape ``(*B, K, D)``.
-
-        Returns:
-            ``(*B, K)``, in nats.
-        """
-        value = self.target(observation).log_prob(latent)
-        if self.reference_prior is not None:
-            return value - self.reference_prior.log_prob(latent)
-        return value + 0.5 * (latent.square().sum(-1) + latent.shape[-1] * math.log(2 * math.pi))
 
 
 class ParticleFilter(TensorDictModuleBase):
@@ -81,7 +37,8 @@ class ParticleFilter(TensorDictModuleBase):
     1. *resample*, systematically, if the effective sample size is below ``resample_threshold * K``;
     2. *predict* (bootstrap proposal): :math:`Z^{(k)}_{t+1} \sim p_\phi(\cdot \mid Z^{(k)}_t, u_t)`;
     3. *weigh*: :math:`w_{t+1} \propto w_t\, L(x_{t+1} \mid Z_{t+1})`, in log space, with an observation
-       model :math:`L = p_\psi(x \mid Z)` (option A) or a :class:`PseudoLikelihood` (option B).
+       model :math:`L = p_\psi(x \mid Z)` (option A) or a
+       :class:`~torchrl_vjepa.belief.PseudoLikelihood` (option B).
 
     The paper resamples at the end of a step; doing it first in the next one is the same algorithm, and
     the belief in between keeps its weights, whose mean has less variance. The normaliser of the weights is
@@ -142,7 +99,7 @@ class ParticleFilter(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from torch.distributions import Normal
-        >>> from torchrl_vjepa.distributions import diag_gaussian
+        >>> from torchrl_vjepa import PseudoLikelihood, diag_gaussian
         >>> def walk(latent, action):
         ...     return diag_gaussian(latent + action, 0.1 * torch.ones(1))
         >>> def sensor(observation, latent):  # option A: log N(x; Z, 0.2)
@@ -153,6 +110,28 @@ class ParticleFilter(TensorDictModuleBase):
         >>> belief.mean.round(decimals=1), log_evidence.shape
         (tensor([[1.5000],
                 [0.5000]]), torch.Size([2]))
+
+        Between encoder and planner, with the encoder's latent as the measurement (option B):
+
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictSequential
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_vjepa import CEM, VJEPA, LatentEnv, Predictor, linear_encoder, quadratic_cost
+        >>> model = VJEPA(linear_encoder(20, 4), Predictor(4, action_dim=2))
+        >>> likelihood = PseudoLikelihood(lambda z: diag_gaussian(z, 0.5 * torch.ones(1)))
+        >>> filter = ParticleFilter(model, likelihood, num_particles=100, observation_key="latent")
+        >>> world = LatentEnv(
+        ...     model,
+        ...     action_spec=Bounded(-1, 1, (2,)),
+        ...     cost=quadratic_cost(torch.zeros(4)),
+        ...     how="sample",
+        ...     num_samples=8,
+        ...     belief_key=("next", "belief"),
+        ... )
+        >>> policy = TensorDictSequential(model.encoder, filter, CEM(world, 3, 2, 64))
+        >>> out = policy(TensorDict(observation=torch.zeros(5, 20), batch_size=[5]))
+        >>> out["action"].shape, out["next", "belief", "particles"].shape
+        (torch.Size([5, 2]), torch.Size([5, 100, 4]))
     """
 
     def __init__(
@@ -207,16 +186,21 @@ class ParticleFilter(TensorDictModuleBase):
         self.latent_dim, self.action_dim = int(latent_dim or 0), int(action_dim or 0)
         self.observation_ndim, self.return_stats = observation_ndim, return_stats
         self.generator = generator
-        parameter = next((p for p in self.parameters() if p.is_floating_point()), None)
-        if dtype is None:
-            dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
-        self.dtype = dtype
+        self._dtype = dtype
         self.action_key, self.belief_key = unravel_key(action_key), unravel_key(belief_key)
         memory = [unravel_key((belief_key, name)) for name in ("particles", "log_weights", "action")]
         self.in_keys = [unravel_key(observation_key), *memory, unravel_key(init_key)]
         self.out_keys = [unravel_key(latent_key), *(unravel_key(("next", key)) for key in memory[:2])]
         if return_stats:
             self.out_keys += [("belief_stats", "log_evidence"), ("belief_stats", "effective_sample_size")]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """What the particles are stored in; by default it follows the parameters."""
+        if self._dtype is not None:
+            return self._dtype
+        parameter = next((p for p in self.parameters() if p.is_floating_point()), None)
+        return torch.get_default_dtype() if parameter is None else parameter.dtype
 
     def start(self, observation: Tensor) -> tuple[ParticleBelief, Tensor]:
         """The belief after the first observation.
@@ -297,7 +281,7 @@ class ParticleFilter(TensorDictModuleBase):
 
         Examples:
             >>> import torch
-            >>> from torchrl_vjepa.distributions import diag_gaussian
+            >>> from torchrl_vjepa import PseudoLikelihood, diag_gaussian
             >>> filter = ParticleFilter(
             ...     lambda z, u: diag_gaussian(z + u, torch.ones(1)),
             ...     PseudoLikelihood(lambda x: diag_gaussian(x, torch.ones_like(x))),
