@@ -26,7 +26,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule, CEMPlanner, get_env_transforms_from_module
 
-from torchrl_vjepa.belief import ParticleBelief, ParticleFilter, PseudoLikelihood
+from torchrl_vjepa.belief import LinearObservation, ParticleBelief, ParticleFilter, PseudoLikelihood
 from torchrl_vjepa.costs import quadratic_cost
 from torchrl_vjepa.distributions import Delta, diag_gaussian
 from torchrl_vjepa.encoders import linear_encoder
@@ -263,31 +263,17 @@ def test_the_filter_steers_the_noisy_tv() -> None:
     env = BatchedNoisyTVEnv(8, noise_scale, seed=0, episode_length=40)
     system = env.system
     kalman = KalmanFilter(system, noise_scale)
-    F, G, H = kalman.F, kalman.G, kalman.H
     std = kalman.process_covariance.diagonal().sqrt()
-    noise = system.sensor_std**2 * torch.eye(len(H)).double()
-    updates = {}  # of a prediction and of the prior: gain, and factor of the covariance
-    for name, prior in (("step", torch.diag(std**2)), ("start", torch.eye(8).double())):
-        gain = prior @ H.mT @ torch.linalg.inv(H @ prior @ H.mT + noise)
-        covariance = prior - gain @ H @ prior
-        updates[name] = gain, torch.linalg.cholesky(0.5 * (covariance + covariance.mT))
+    sensor = LinearObservation(kalman.H, system.sensor_std)
 
     def transition(latent: Tensor, action: Tensor) -> Distribution:
-        return diag_gaussian(latent @ F.mT + action @ G.mT, std)
-
-    def likelihood(observation: Tensor, latent: Tensor) -> Tensor:
-        return -0.5 * (observation - latent @ H.mT).square().sum(-1) / system.sensor_std**2
-
-    def proposal(p: Distribution, observation: Tensor) -> Distribution:
-        gain, factor = updates["step" if p.stddev.max() < 1 else "start"]
-        loc = p.mean + (observation - p.mean @ H.mT) @ gain.mT
-        return torch.distributions.MultivariateNormal(loc, scale_tril=factor)
+        return diag_gaussian(latent @ kalman.F.mT + action @ kalman.G.mT, std)
 
     run = ParticleFilter(
         transition,
-        likelihood,
+        sensor,
         num_particles=500,
-        proposal=proposal,
+        proposal=sensor.condition,
         latent_dim=8,
         action_dim=2,
         dtype=torch.float64,

@@ -155,6 +155,21 @@ def test_one_nonlinear_step_against_quadrature() -> None:
     assert covariances.item() == pytest.approx(0.2 + 0.3 * mean**2 + slope**2 * variance, abs=1e-12)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_full_covariances_depend_on_the_state_too(method: Any) -> None:
+    def full(latent: Tensor, action: Tensor) -> Distribution:
+        p = cubic(latent, action)
+        return MultivariateNormal(p.mean, torch.diag_embed(p.variance))
+
+    latent, covariance, actions = problem(2)
+    arguments = (0.3 * latent, actions[..., :2, :1].expand(2, 2, D), method)
+    expected = propagate_moments(cubic, *arguments, covariance=0.05 * covariance)
+    for value, other in zip(
+        propagate_moments(full, *arguments, covariance=0.05 * covariance), expected, strict=True
+    ):
+        torch.testing.assert_close(value, other)
+
+
 def test_nonlinear_moments_against_samples() -> None:
     torch.manual_seed(0)
     predictor = Predictor(D, A, trunk="mlp", num_cells=(16,), residual=True)

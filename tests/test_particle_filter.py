@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal, StudentT
 
-from torchrl_vjepa.belief import ParticleBelief, ParticleFilter, PseudoLikelihood
+from torchrl_vjepa.belief import LinearObservation, ParticleBelief, ParticleFilter, PseudoLikelihood
 from torchrl_vjepa.distributions import Delta, diag_gaussian, product_of_experts
 from torchrl_vjepa.encoders import linear_encoder
 from torchrl_vjepa.heads import TargetScale
@@ -31,15 +31,10 @@ class KalmanSystem:
         self.kalman = KalmanFilter(self.system, noise_scale)
         self.noise_scale = noise_scale
         self.std = self.kalman.process_covariance.diagonal().sqrt()
+        self.sensor = LinearObservation(self.kalman.H, sensor_std)
 
     def transition(self, latent: Tensor, action: Tensor) -> Distribution:
         return diag_gaussian(latent @ self.kalman.F.mT + action @ self.kalman.G.mT, self.std)
-
-    def likelihood(self, observation: Tensor, latent: Tensor) -> Tensor:
-        error = observation - latent @ self.kalman.H.mT
-        std = self.system.sensor_std
-        size = self.system.observation_dim
-        return -0.5 * error.square().sum(-1) / std**2 - size * math.log(std * math.sqrt(2 * math.pi))
 
     def simulate(self, rows: int, steps: int) -> Any:
         generator = torch.Generator().manual_seed(11)
@@ -51,7 +46,7 @@ class KalmanSystem:
     def make_filter(self, seed: int = 0, **kwargs: Any) -> ParticleFilter:
         return ParticleFilter(
             self.transition,
-            self.likelihood,
+            self.sensor,
             latent_dim=3,
             action_dim=1,
             dtype=torch.float64,
@@ -101,30 +96,12 @@ def test_evidence_is_unbiased(problem: KalmanSystem) -> None:
         assert (ratio.mean() - 1).abs() < 4 * ratio.std() / rows**0.5, threshold
 
 
-class Conditioned:
-    """The locally optimal proposal of a linear-Gaussian system: p(z' | z, x)."""
-
-    def __init__(self, problem: KalmanSystem) -> None:
-        h = problem.kalman.H
-        noise = problem.system.sensor_std**2 * torch.eye(len(h), dtype=h.dtype)
-        self.problem, self.h, self.noise = problem, h, noise
-
-    def __call__(self, p: Distribution, observation: Tensor) -> Distribution:
-        prior = torch.diag_embed(p.variance)
-        gain = prior @ self.h.mT @ torch.linalg.inv(self.h @ prior @ self.h.mT + self.noise)
-        innovation = (observation - p.mean @ self.h.mT).unsqueeze(-1)
-        covariance = prior - gain @ self.h @ prior
-        return MultivariateNormal(
-            p.mean + (gain @ innovation).squeeze(-1), 0.5 * (covariance + covariance.mT)
-        )
-
-
 def test_a_proposal_that_looks_at_the_observation() -> None:
     """A sensor so sharp that the bootstrap filter would need many thousand particles."""
     problem = KalmanSystem(sensor_std=0.01)
     data = problem.simulate(10, 20)
     exact = problem.kalman.filter(data["observation"], data["action"])
-    run = problem.make_filter(num_particles=1000, proposal=Conditioned(problem))
+    run = problem.make_filter(num_particles=1000, proposal=problem.sensor.condition)
     out = run.filter(data["observation"], data["action"])
     error = (exact["signal_mean"] - data["signal"]).square().mean()
     assert (out["mean"][..., :2] - data["signal"]).square().mean() < 1.05 * error
@@ -135,6 +112,70 @@ def test_a_proposal_that_looks_at_the_observation() -> None:
         warnings.simplefilter("ignore", RuntimeWarning)
         blind = problem.make_filter(num_particles=1000).filter(data["observation"], data["action"])
     assert blind["effective_sample_size"].median() < 20
+
+
+def test_linear_observation_is_a_kalman_update() -> None:
+    torch.manual_seed(0)
+    matrix, std = torch.randn(5, 3).double(), torch.rand(5).double() + 0.1
+    sensor = LinearObservation(matrix, std)
+    observation, latent = torch.randn(2, 1, 5).double(), torch.randn(2, 7, 3).double()
+    expected = Independent(Normal(latent @ matrix.mT, std), 1).log_prob(observation)
+    torch.testing.assert_close(sensor(observation, latent), expected)
+    factor = torch.randn(2, 7, 3, 3).double()
+    prior = MultivariateNormal(latent, factor @ factor.mT + torch.eye(3).double())
+    gain = prior.covariance_matrix @ matrix.mT
+    gain = gain @ torch.linalg.inv(matrix @ gain + torch.diag(std**2))
+    mean = latent + (gain @ (observation - latent @ matrix.mT).unsqueeze(-1)).squeeze(-1)
+    covariance = prior.covariance_matrix - gain @ matrix @ prior.covariance_matrix
+    posterior = sensor.condition(prior, observation)
+    torch.testing.assert_close(posterior.mean, mean)
+    torch.testing.assert_close(posterior.covariance_matrix, covariance)
+    # Bayes: prior times likelihood over posterior is the same wherever it is evaluated.
+    evidence = [
+        prior.log_prob(z) + sensor(observation, z) - posterior.log_prob(z)
+        for z in (latent, torch.zeros_like(latent))
+    ]
+    torch.testing.assert_close(*evidence)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "std", "message"),
+    [
+        (torch.zeros(3), 1.0, "matrix must be finite with shape"),
+        (torch.full((3, 2), math.nan), 1.0, "matrix must be finite"),
+        (torch.zeros(3, 2), 0.0, "std must be positive"),
+        (torch.zeros(3, 2), torch.ones(2), r"a number or of shape \(3,\)"),
+        (torch.zeros(3, 2), math.inf, "std must be positive"),
+    ],
+)
+def test_bad_sensors_are_refused(matrix: Tensor, std: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        LinearObservation(matrix, std)
+
+
+@pytest.mark.parametrize("noise_scale", [0.0, 4.0, 8.0])
+def test_the_paper_s_noisy_tv_with_a_thousand_particles(noise_scale: float) -> None:
+    system = LinearGaussianSystem(control_dim=2, seed=1)
+    kalman = KalmanFilter(system, noise_scale)
+    std = kalman.process_covariance.diagonal().sqrt()
+    sensor = LinearObservation(kalman.H, system.sensor_std)
+    run = ParticleFilter(
+        lambda z, u: diag_gaussian(z @ kalman.F.mT + u @ kalman.G.mT, std),
+        sensor,
+        proposal=sensor.condition,
+        num_particles=1000,
+        latent_dim=8,
+        action_dim=2,
+        dtype=torch.float64,
+        generator=torch.Generator().manual_seed(0),
+    )
+    data = system.simulate(12, noise_scale, torch.randn(12, 2), batch_size=(6,), seed=3, dtype=torch.float64)
+    exact = kalman.filter(data["observation"], data["action"])
+    out = run.filter(data["observation"], data["action"])
+    error = (exact["signal_mean"] - data["signal"]).square().mean()
+    assert (out["mean"][..., :4] - data["signal"]).square().mean() < 1.05 * error
+    difference = out["log_evidence"].sum(-1) - exact["log_evidence"].sum(-1)
+    assert difference.abs().max() < 0.5
 
 
 def test_nonlinear_filter_against_a_grid() -> None:
@@ -412,7 +453,7 @@ def test_randomness_is_the_generators(problem: KalmanSystem) -> None:
     data = problem.simulate(2, 5)
     arguments = data["observation"], data["action"]
     state = torch.get_rng_state()
-    run = problem.make_filter(num_particles=20, proposal=Conditioned(problem))
+    run = problem.make_filter(num_particles=20, proposal=problem.sensor.condition)
     twin = copy.deepcopy(run)
     first = run.filter(*arguments)["mean"]
     assert torch.equal(first, twin.filter(*arguments)["mean"])

@@ -2,6 +2,7 @@
 
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import (
+    LinearObservation,
     ParticleBelief,
     ParticleFilter,
     PseudoLikelihood,
@@ -63,6 +64,7 @@ __all__ = [
     "LatentModel",
     "LatentPredictionLoss",
     "LinearGaussianSystem",
+    "LinearObservation",
     "LinearProbe",
     "MPPI",
     "NoisyTVEnv",
