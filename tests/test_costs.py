@@ -7,8 +7,6 @@ import pickle
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -17,7 +15,6 @@ from torchrl_vjepa.costs import (
     Cost,
     QuadraticReward,
     action_cost,
-    expectation,
     quadratic_cost,
 )
 
@@ -125,13 +122,6 @@ class TestSums:
     def test_what_is_no_number_is_refused(self) -> None:
         with pytest.raises(TypeError):
             action_cost() * action_cost()
-
-
-@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=8))
-def test_expectation_is_the_mean_over_samples(values: list[float]) -> None:
-    costs = torch.tensor(values, dtype=torch.float64)[:, None].expand(-1, 3)
-    expected = torch.full((3,), sum(values) / len(values), dtype=torch.float64)
-    torch.testing.assert_close(expectation(costs), expected)
 
 
 class TestQuadraticReward:

@@ -13,7 +13,7 @@ from torchrl_vjepa.belief import (
     surprise,
     systematic_resampling,
 )
-from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
+from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
 from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
@@ -39,6 +39,7 @@ from torchrl_vjepa.objectives import (
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
+from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.whitening import Whitening
 
@@ -47,6 +48,7 @@ __all__ = [
     "BJEPALoss",
     "BatchedNoisyTVEnv",
     "CEM",
+    "ChanceConstraint",
     "CollapseWarning",
     "Cost",
     "Delta",
@@ -89,14 +91,17 @@ __all__ = [
     "WindowLoss",
     "action_cost",
     "composition_gap",
+    "cvar",
     "diag_gaussian",
     "effective_rank",
     "effective_sample_size",
+    "entropic",
     "expectation",
     "gaussian_entropy",
     "history_encoder",
     "linear_encoder",
     "linear_probe",
+    "mean_variance",
     "mlp_encoder",
     "mutual_information_bound",
     "point_estimate",
@@ -108,4 +113,5 @@ __all__ = [
     "sliced_gaussian_distance",
     "surprise",
     "systematic_resampling",
+    "worst_case",
 ]

@@ -1,4 +1,4 @@
-r"""Costs over latents and actions, risk functionals, and a quadratic reward head.
+r"""Costs over latents and actions, and a quadratic reward head.
 
 A cost is a callable ``(latent (*B, D), action (*B, A)) -> (*B)``, lower is better. Planning calls
 it with the *next* latent :math:`Z_{t+k+1}` and the action :math:`u_{t+k}` that led to it, as in
@@ -16,15 +16,12 @@ from torch import Tensor, nn
 __all__ = [
     "Cost",
     "QuadraticReward",
-    "Risk",
     "StageCost",
     "action_cost",
-    "expectation",
     "quadratic_cost",
 ]
 
 StageCost = Callable[[Tensor, Tensor], Tensor]
-Risk = Callable[[Tensor], Tensor]
 
 
 class Cost(nn.Module):
@@ -215,23 +212,6 @@ def action_cost(weight: Tensor | float = 1.0) -> Cost:
         tensor([0.5000])
     """
     return _ActionCost(_checked_weight(weight, None))
-
-
-def expectation(costs: Tensor) -> Tensor:
-    r"""Risk-neutral functional, the sample mean :math:`\frac1M \sum_m J^{(m)}`.
-
-    Args:
-        costs: of shape ``(M, *B)``, samples first.
-
-    Returns:
-        Of shape ``(*B)``.
-
-    Examples:
-        >>> import torch
-        >>> expectation(torch.tensor([[1.0], [3.0]]))
-        tensor([2.])
-    """
-    return costs.mean(dim=0)
 
 
 class QuadraticReward(nn.Module):

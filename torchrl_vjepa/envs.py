@@ -8,20 +8,22 @@ better. :class:`LatentEnv` answers both on plain tensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.distributions import Distribution, Independent, Normal
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
-from torchrl_vjepa.belief import Transition, rollout, systematic_resampling
-from torchrl_vjepa.costs import Risk, StageCost, expectation
-from torchrl_vjepa.distributions import Delta, point_estimate, sample
+from torchrl_vjepa.belief import rollout, systematic_resampling
+from torchrl_vjepa.common_random_numbers import CommonNoise
+from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
+from torchrl_vjepa.latent_step import LatentStep
+from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, plan_cost
 
 __all__ = ["LatentEnv"]
 
@@ -34,7 +36,9 @@ class LatentEnv(ModelBasedEnvBase):
     tensordicts of any batch size go in. An imagined ``done`` never triggers a reset.
 
     :meth:`objective` is the cost of whole plans on plain tensors (``eq:latent_mpc_objective``); the
-    planners of this package call it, and TorchRL's own planners roll the environment out.
+    planners of this package call it, and TorchRL's own planners roll the environment out. How plans
+    are sampled and judged (``num_samples``, ``risk``, ``constraints``) is a default that a planner can
+    replace for itself; a plan with one trajectory whose cost is not finite costs infinity.
 
     Args:
         model: what predicts: a :class:`~torchrl_vjepa.models.JEPA` or anything with ``predictor``;
@@ -49,10 +53,13 @@ class LatentEnv(ModelBasedEnvBase):
         cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; the reward is minus the cost.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
         num_samples: trajectories ``M`` per candidate plan for ``how="sample"``, or from ``M`` particles
-            of a belief with any ``how``. They share their random numbers across candidates and across
-            the batch for diagonal Gaussian predictions (common random numbers: the ranking of plans
-            does not depend on luck); other distributions are sampled independently.
-        risk: ``(costs (M, *B)) -> (*B)``, applied to the summed costs of the ``M`` trajectories.
+            of a belief with any ``how``. They share their
+            random numbers across candidates and across the batch (common random numbers: the ranking
+            of plans does not depend on luck), as far as
+            :func:`~torchrl_vjepa.common_random_numbers.sample_common` knows the distribution.
+        risk: ``(costs (M, *B)) -> (*B)``, applied to the summed costs of the ``M`` trajectories; by
+            default their :func:`~torchrl_vjepa.risk.expectation`.
+        constraints: chance constraints on the ``M`` trajectories.
         latent_dim: size ``D``; needed only if the model does not tell.
         latent_key: where the latent is; by default the model's, else ``"latent"``.
         belief_key: where a belief is, ``("next", "belief")`` behind a
@@ -98,7 +105,8 @@ class LatentEnv(ModelBasedEnvBase):
         cost: StageCost | None = None,
         how: Literal["mean", "mode", "sample"] = "mean",
         num_samples: int = 1,
-        risk: Risk = expectation,
+        risk: Risk | None = None,
+        constraints: Sequence[ChanceConstraint] = (),
         latent_dim: int | None = None,
         latent_key: NestedKey | None = None,
         belief_key: NestedKey | None = None,
@@ -114,11 +122,13 @@ class LatentEnv(ModelBasedEnvBase):
             )
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
-        if num_samples < 1 or (num_samples > 1 and how != "sample" and belief_key is None):
+        sampled = how == "sample" or belief_key is not None
+        if num_samples < 1 or (num_samples > 1 and not sampled):
             raise ValueError(
                 "num_samples must be at least 1, and 1 unless how='sample', "
                 f"got {num_samples} with how={how!r} and no belief_key"
             )
+        Sampling.checked(num_samples if sampled else None, risk, constraints)
         predictor = getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
         if not callable(transition):
@@ -142,7 +152,7 @@ class LatentEnv(ModelBasedEnvBase):
                 f"action_spec must hold the predictor's action_dim={expected} numbers, got shape "
                 f"{tuple(spec.shape)}; for a batched environment give action_spec_unbatched"
             )
-        world_model = _LatentStep(
+        world_model = LatentStep(
             predictor, transition, reward_model, cost, how, spec.shape,
             latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key),
         )  # fmt: skip
@@ -159,6 +169,7 @@ class LatentEnv(ModelBasedEnvBase):
         if belief_key is not None:
             self.planning_keys = [unravel_key((belief_key, name)) for name in ("particles", "log_weights")]
         self.how, self.num_samples, self.risk = how, num_samples, risk
+        self.constraints: Any = nn.ModuleList(constraints)  # registered: their modules move along
         self.rng: torch.Generator | None = None
         latent_spec = Unbounded((latent_dim,), device=self.device, dtype=dtype)
         self.observation_spec = Composite({self.latent_key: latent_spec}, device=self.device)
@@ -206,12 +217,43 @@ class LatentEnv(ModelBasedEnvBase):
         names = ("particles", "log_weights")
         return TensorDict(dict(zip(names, values, strict=True)), batch_size=start.shape[:-2])
 
+    def sampling(
+        self,
+        num_samples: int | None = None,
+        risk: Risk | None = None,
+        constraints: Sequence[ChanceConstraint] | None = None,
+    ) -> Sampling:
+        """How plans are evaluated where this is asked for: the environment's own settings for the rest.
+
+        Args:
+            num_samples: trajectories per plan; ``None``: as many as the environment samples, if it does.
+            risk: ``None``: the environment's.
+            constraints: ``None``: the environment's.
+
+        Returns:
+            The settings together.
+
+        Raises:
+            ValueError: if ``num_samples`` is not positive, or a risk or constraint has no samples to read.
+            TypeError: if ``risk`` is not callable or ``constraints`` holds something else.
+        """
+        sampled = self.how == "sample" or self.belief_key is not None
+        own = self.num_samples if sampled else None
+        return Sampling.checked(
+            own if num_samples is None else num_samples,
+            self.risk if risk is None else risk,
+            self.constraints if constraints is None else constraints,
+        )
+
     def objective(
         self,
         state: Tensor | TensorDictBase,
         actions: Tensor,
         *,
         generator: torch.Generator | None = None,
+        num_samples: int | None = None,
+        risk: Risk | None = None,
+        constraints: Sequence[ChanceConstraint] | None = None,
     ) -> Tensor:
         r"""Cost of candidate plans, :math:`\sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k})`.
 
@@ -220,38 +262,79 @@ class LatentEnv(ModelBasedEnvBase):
         Args:
             state: what :meth:`planning_state` gives: latents of shape ``(*B, D)``, or a belief.
             actions: candidate plans, of shape ``(*B, N, H, A)``.
-            generator: source of randomness for ``how="sample"`` and for the particles of a belief.
+            generator: source of randomness for sampled trajectories.
+            num_samples: trajectories per plan; ``None``: as the environment does.
+            risk: of their costs; ``None``: the environment's.
+            constraints: on their latents and actions; ``None``: the environment's.
 
         Returns:
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
 
         Raises:
-            ValueError: if a shape does not fit.
+            ValueError: if a shape does not fit, or what is asked for needs samples and has none.
         """
+        num_samples, risk, constraints = self.sampling(num_samples, risk, constraints)
+        latents, actions = self._imagine(state, actions, num_samples, generator)
+        costs = self.world_model.stage_cost(latents, actions).sum(dim=-1)
+        return costs if num_samples is None else plan_cost(costs, risk, constraints, latents, actions)
+
+    def violation_probability(
+        self,
+        state: Tensor | TensorDictBase,
+        actions: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+        num_samples: int | None = None,
+        constraints: Sequence[ChanceConstraint] | None = None,
+    ) -> Tensor:
+        """How often candidate plans violate each constraint, among their sampled trajectories.
+
+        Args:
+            state: what :meth:`planning_state` gives: latents of shape ``(*B, D)``, or a belief.
+            actions: candidate plans, of shape ``(*B, N, H, A)``.
+            generator: source of randomness.
+            num_samples: trajectories per plan; ``None``: as the environment does.
+            constraints: ``C`` of them; ``None``: the environment's.
+
+        Returns:
+            Frequencies of shape ``(*B, N, C)``.
+
+        Raises:
+            ValueError: if there are no constraints or no samples, or a shape does not fit.
+        """
+        num_samples, _, constraints = self.sampling(num_samples, None, constraints)
+        if not constraints:
+            raise ValueError("constraints must hold at least one ChanceConstraint, got none")
+        latents, actions = self._imagine(state, actions, num_samples, generator)
+        return torch.stack([constraint(latents, actions) for constraint in constraints], dim=-1)
+
+    def _imagine(
+        self,
+        state: Tensor | TensorDictBase,
+        actions: Tensor,
+        num_samples: int | None,
+        generator: torch.Generator | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Latents and actions, ``(*B, N, H, ...)``, or ``(M, *B, N, H, ...)`` where they are sampled."""
         batch, (num_candidates, _, action_dim) = actions.shape[:-3], actions.shape[-3:]
-        belief = not isinstance(state, Tensor)
-        start = _drawn(state, self.num_samples, generator) if belief else state
-        expected = (*batch, self.latent_dim)
-        if start.shape[belief:] != expected or action_dim != self.action_dim:
+        drawn = not isinstance(state, Tensor)
+        start = _drawn(state, num_samples or 1, generator) if drawn else state
+        if start.shape[drawn:] != (*batch, self.latent_dim) or action_dim != self.action_dim:
             raise ValueError(
                 f"state and actions must have shapes (*B, {self.latent_dim}) and (*B, N, H, "
-                f"{self.action_dim}), got {tuple(start.shape[belief:])} and {tuple(actions.shape)}"
+                f"{self.action_dim}), got {tuple(start.shape[drawn:])} and {tuple(actions.shape)}"
             )
         actions = actions.to(start.dtype)
-        model = self.world_model
-        if not belief and self.how == "sample":
-            start = start.expand(self.num_samples, *start.shape)
+        transition = self.world_model.transition
+        if not drawn and num_samples is not None:
+            start = start.expand(num_samples, *start.shape)
         start = start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim)
-        if not belief and self.how != "sample":
-            latents = rollout(model.transition, start, actions, self.how)
-            return model.stage_cost(latents, actions).sum(dim=-1)
-        actions = actions.expand(self.num_samples, *actions.shape)
-        if self.how == "sample":
-            latents = rollout(_SharedNoise(model.transition, generator), start, actions, "mean")
-        else:
-            latents = rollout(model.transition, start, actions, self.how)
-        costs = self.risk(model.stage_cost(latents, actions).sum(dim=-1))
-        return _checked_shape(costs, (*batch, num_candidates), "risk")
+        if num_samples is None:
+            return rollout(transition, start, actions, self.how), actions
+        actions = actions.expand(num_samples, *actions.shape)
+        if drawn and self.how != "sample":  # the belief is sampled, what follows is not
+            return rollout(transition, start, actions, self.how), actions
+        return rollout(CommonNoise(transition, generator), start, actions, "mean"), actions
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
         """Never: an imagined end must not trigger a reset.
@@ -300,155 +383,6 @@ class LatentEnv(ModelBasedEnvBase):
         super().__setstate__({**state, "rng": None if rng is None else unpack_generator(rng)})
 
 
-class _LatentStep(TensorDictModuleBase):
-    """``latent, action -> next latent -> reward``, on tensors and on tensordicts."""
-
-    def __init__(
-        self,
-        predictor: Any,
-        transition: Transition,
-        reward_model: TensorDictModuleBase | None,
-        cost: StageCost | None,
-        how: Literal["mean", "mode", "sample"],
-        action_shape: torch.Size,
-        *,
-        latent_key: NestedKey,
-        action_key: NestedKey,
-        reward_key: NestedKey,
-    ) -> None:
-        super().__init__()
-        self.predictor = predictor  # registered: its parameters move and synchronise with the env
-        self.transition = transition
-        self.reward_model: Any = reward_model
-        self.cost = cost
-        self.how = how
-        self.action_shape = tuple(action_shape)
-        self.action_dim = math.prod(action_shape)
-        self.latent_key, self.action_key = unravel_key(latent_key), unravel_key(action_key)
-        self.reward_key = reward_key
-        self.in_keys = [self.latent_key, self.action_key]
-        self.out_keys = [self.latent_key, self.reward_key]
-        self.reward_calls_tensors = False
-        if reward_model is not None:
-            if not isinstance(reward_model, TensorDictModuleBase):
-                raise TypeError(
-                    "reward_model must be a TensorDictModule, for instance TensorDictModule("
-                    "QuadraticReward(D, A), ['latent', 'action'], ['reward']), got "
-                    f"{type(reward_model).__name__}"
-                )
-            reads = [unravel_key(key) for key in reward_model.in_keys]
-            if not set(reads) <= set(self.in_keys):
-                raise KeyError(
-                    f"reward_model must read only latent_key={self.latent_key!r} and "
-                    f"action_key={self.action_key!r}, got in_keys={reads}; rename its in_keys"
-                )
-            if self.reward_key not in [unravel_key(key) for key in reward_model.out_keys]:
-                raise KeyError(
-                    f"reward_model must write reward_key={self.reward_key!r}, "
-                    f"got out_keys={list(reward_model.out_keys)}"
-                )
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.update(self.step(tensordict, None))
-
-    def step(self, tensordict: TensorDictBase, generator: torch.Generator | None) -> TensorDictBase:
-        # A new tensordict: no stale done or reward of the input passes through.
-        latent = tensordict.get(self.latent_key)
-        action = tensordict.get(self.action_key)
-        action = action.reshape((*latent.shape[:-1], self.action_dim)).to(latent.dtype)
-        p = self.transition(latent, action)
-        latent = point_estimate(p, self.how, generator=generator)
-        reward = -self.stage_cost(latent, action).unsqueeze(-1)
-        out = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
-        return out.set(self.latent_key, latent).set(self.reward_key, reward)
-
-    def stage_cost(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Costs ``(*B)`` of next latents ``(*B, D)`` and flat actions ``(*B, A)``, all at once."""
-        if self.cost is not None:
-            return _checked_shape(self.cost(latent, action), latent.shape[:-1], "cost")
-        batch = latent.shape[:-1]
-        shaped = action.reshape((*batch, *self.action_shape))
-        if self.reward_calls_tensors:
-            reward = self._reward_of_tensors(latent, shaped)
-        else:
-            reward = self._reward_of_tensordict(latent, shaped)
-        return -_checked_shape(reward, (*batch, 1), "reward_model").squeeze(-1)
-
-    def probe(
-        self, latent_dim: int, action_dim: int, device: torch.device | None, dtype: torch.dtype
-    ) -> None:
-        """Call every part on a small block, in evaluation mode, so that errors come early."""
-        batch = (2, 3)
-        latent = torch.linspace(-1.0, 1.0, 6 * latent_dim, device=device, dtype=dtype)
-        latent = latent.reshape(*batch, latent_dim)
-        action = torch.linspace(-0.9, 1.1, 6 * action_dim, device=device, dtype=dtype)
-        action = action.reshape(*batch, action_dim)
-        training = [module for module in self.modules() if module.training]
-        for module in training:
-            module.training = False
-        try:
-            with torch.no_grad():
-                self._probe(latent, action)
-        finally:
-            for module in training:
-                module.training = True
-
-    def _probe(self, latent: Tensor, action: Tensor) -> None:
-        batch = latent.shape[:-1]
-        p = self.transition(latent, action)
-        if not isinstance(p, Distribution):
-            raise TypeError(
-                "model must return a torch Distribution over the next latent, got "
-                f"{type(p).__name__}; wrap a point prediction in Delta"
-            )
-        if tuple(p.batch_shape) != batch or tuple(p.event_shape) != latent.shape[-1:]:
-            raise ValueError(
-                f"model must return a distribution with batch shape {tuple(batch)} and event shape "
-                f"{tuple(latent.shape[-1:])} for latent {tuple(latent.shape)} and action "
-                f"{tuple(action.shape)}, got {tuple(p.batch_shape)} and {tuple(p.event_shape)}"
-            )
-        first = self.stage_cost(latent, action)
-        model = self.reward_model
-        if (
-            type(model) is TensorDictModule
-            and isinstance(model.module, nn.Module)
-            and list(map(unravel_key, model.out_keys)) == [self.reward_key]
-        ):
-            # A plain network needs no tensordict per call, provided that it says the same.
-            try:
-                second = self._reward_of_tensors(latent, action.reshape((*batch, *self.action_shape)))
-                self.reward_calls_tensors = torch.equal(second.squeeze(-1), -first)
-            except (TypeError, RuntimeError, ValueError):  # keyword inputs, for instance
-                self.reward_calls_tensors = False
-
-    def _reward_of_tensors(self, latent: Tensor, action: Tensor) -> Tensor:
-        model = self.reward_model
-        inputs = {self.latent_key: latent, self.action_key: action}
-        return model.module(*(inputs[unravel_key(key)] for key in model.in_keys))
-
-    def _reward_of_tensordict(self, latent: Tensor, action: Tensor) -> Tensor:
-        inputs = TensorDict({}, batch_size=latent.shape[:-1], device=latent.device)
-        inputs.set(self.latent_key, latent).set(self.action_key, action)
-        return self.reward_model(inputs).get(self.reward_key)
-
-
-class _SharedNoise:
-    """A transition that moves to one draw, the same noise for every candidate and batch row."""
-
-    def __init__(self, transition: Transition, generator: torch.Generator | None) -> None:
-        self.transition = transition
-        self.generator = generator
-
-    def __call__(self, latent: Tensor, action: Tensor) -> Delta:
-        p = self.transition(latent, action)
-        if not (isinstance(p, Independent) and isinstance(p.base_dist, Normal)):
-            return Delta(sample(p, generator=self.generator))
-        loc, scale = p.base_dist.loc, p.base_dist.scale
-        shape = (loc.shape[0], *[1] * (loc.ndim - 2), loc.shape[-1])
-        noise = torch.randn(shape, generator=self.generator, device=loc.device, dtype=loc.dtype)
-        return Delta(loc + scale * noise)
-
-
 def _drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:
     """Particles ``(M, *B, D)`` of a belief, by one random number for all rows, as all planning noise."""
     index = systematic_resampling(
@@ -460,16 +394,6 @@ def _drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator 
 
 def _first(*values: Any) -> Any:
     return next((value for value in values if value is not None), None)
-
-
-def _checked_shape(value: Tensor, expected: tuple[int, ...], name: str) -> Tensor:
-    if not isinstance(value, Tensor) or tuple(value.shape) != tuple(expected):
-        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise ValueError(
-            f"{name} must return a tensor of shape {tuple(expected)} for the batch "
-            f"{tuple(expected)[: None if name != 'reward_model' else -1]}, got {got}"
-        )
-    return value
 
 
 def _single_leaf(spec: TensorSpec, action_key: NestedKey) -> TensorSpec:

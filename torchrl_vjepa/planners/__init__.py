@@ -1,9 +1,10 @@
 """Planners that act through a model: one loop, and one method per planner."""
 
-from torchrl_vjepa.planners.base import Plan, Planner, Proposal
+from torchrl_vjepa.planners.base import Plan, Planner
 from torchrl_vjepa.planners.cem import CEM
 from torchrl_vjepa.planners.env_objective import EnvObjective
 from torchrl_vjepa.planners.mppi import MPPI
+from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.random_shooting import RandomShooting
 
 __all__ = ["CEM", "MPPI", "EnvObjective", "Plan", "Planner", "Proposal", "RandomShooting"]

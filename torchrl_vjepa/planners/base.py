@@ -5,39 +5,25 @@ from __future__ import annotations
 import abc
 import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import MPCPlannerBase
 
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
+from torchrl_vjepa.planners.proposal import Proposal, continuous_action, gaussian_of_bounds
+from torchrl_vjepa.risk import REJECTED_COST, ChanceConstraint, Risk
 
-__all__ = ["Plan", "Planner", "Proposal"]
+__all__ = ["Plan", "Planner"]
 
 _GENERATORS = ("_generator", "_model_generator")
-
-
-class Proposal(NamedTuple):
-    """Diagonal Gaussian over action sequences, in the units of the actions.
-
-    Attributes:
-        mean: of shape ``(*B, H, A)``, inside the bounds.
-        std: of shape ``(*B, H, A)``, positive.
-
-    Examples:
-        >>> import torch
-        >>> Proposal(torch.zeros(5, 2), torch.ones(5, 2)).mean.shape
-        torch.Size([5, 2])
-    """
-
-    mean: Tensor
-    std: Tensor
 
 
 class Plan(NamedTuple):
@@ -47,7 +33,8 @@ class Plan(NamedTuple):
         actions: the plan, of shape ``(*B, H, A)``; its first step is executed.
         std: spread of the last proposal, of shape ``(*B, H, A)``.
         best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
-        best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite.
+        best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite, at least
+            :data:`~torchrl_vjepa.risk.REJECTED_COST` where no plan satisfied the chance constraints.
 
     Examples:
         >>> import torch
@@ -75,6 +62,11 @@ class Planner(MPCPlannerBase):
     **Costs that are not finite rank last** (``nan`` and both infinities: a cost of minus infinity
     is a fault, not a good plan). Where no cost is finite the proposal keeps its mean, so the action
     is finite and inside the bounds, and one warning is given.
+
+    **Risk.** ``num_samples`` trajectories per plan, their ``risk`` and chance ``constraints`` replace
+    those of the environment, for this planner. The model's noise is common to all candidates and
+    rounds. Plans that a constraint rejects have no part in the refinement as long as a feasible one is
+    known; where there is none, the search heads for the least violation and a warning is given.
 
     **Memory between steps is in the tensordict.** With ``warm_start`` the planner reads
     ``plan_key`` and ``init_key`` and writes ``("next", plan_key)``, the plan shifted by one step
@@ -104,16 +96,26 @@ class Planner(MPCPlannerBase):
         min_std: floor under the spread, as a fraction of the one after a cold start.
         antithetic: draw noise in pairs of opposite sign.
         output: the plan is the ``"mean"`` of the proposal, or the ``"best"`` candidate seen.
+        num_samples: trajectories ``M`` imagined for each plan; the environment's way by default.
+        risk: ``(costs (M, *B)) -> (*B)`` of their costs, for instance
+            :func:`~torchrl_vjepa.risk.cvar`; the environment's by default.
+        constraints: chance constraints on them (:class:`~torchrl_vjepa.risk.ChanceConstraint`); the
+            environment's by default. The mean of feasible plans need not be feasible:
+            ``output="best"`` returns a plan that was checked.
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
-            (spread of the proposal) and ``("plan_stats", "cost")`` (predicted cost of the plan).
+            (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
+            there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
+            ``(*B, C)``); cost and violation from fresh noise.
         plan_key: the plan's entry.
         init_key: set where an episode begins (``InitTracker``).
         seed: of the generator; by default the global seed, ``torch.initial_seed()``.
         generator: used instead of one made from ``seed``.
 
     Raises:
-        ValueError: if an argument is out of its range, or the bounds of an action are degenerate.
-        TypeError: if the action is not one continuous tensor.
+        ValueError: if an argument is out of its range, the bounds of an action are degenerate, or a risk
+            or constraint has no samples to read.
+        TypeError: if the action is not one continuous tensor, or the environment cannot evaluate the risk
+            or constraints.
 
     Examples:
         A planner of one's own is one method:
@@ -161,6 +163,9 @@ class Planner(MPCPlannerBase):
         min_std: float = 0.01,
         antithetic: bool = True,
         output: Literal["mean", "best"] = "mean",
+        num_samples: int | None = None,
+        risk: Risk | None = None,
+        constraints: Sequence[ChanceConstraint] | None = None,
         return_stats: bool = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
@@ -189,13 +194,17 @@ class Planner(MPCPlannerBase):
         if seed is not None and generator is not None:
             raise ValueError("at most one of seed and generator must be given, got both")
         leaves = [unravel_key(key) for key in env.full_action_spec.keys(True, True)]
-        spec = _continuous(env.full_action_spec[leaves[0]] if len(leaves) == 1 else None, leaves)
-        low, high, centre, std = _gaussian_of_bounds(spec, init_std)
+        spec = continuous_action(env.full_action_spec[leaves[0]] if len(leaves) == 1 else None, leaves)
+        low, high, centre, std = gaussian_of_bounds(spec, init_std)
         written = leaves[0] if action_key is None else unravel_key(action_key)
         super().__init__(env, written)
         # Looked up on the class: a transform around a LatentEnv must be stepped, not bypassed.
         offers_objective = callable(getattr(type(env), "objective", None))
         self._env_objective = None if offers_objective else EnvObjective(env)
+        asked = {"num_samples": num_samples, "risk": risk, "constraints": constraints}
+        self._constrained = self._checked_sampling(_given(asked))
+        self.num_samples, self.risk = num_samples, risk
+        self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
         self.num_candidates, self.top_k = num_candidates, top_k
         self.warm_start, self.warm_std, self.min_std = warm_start, warm_std, min_std
@@ -211,7 +220,8 @@ class Planner(MPCPlannerBase):
             reads += [self.plan_key, self.init_key]
             writes.append(unravel_key(("next", self.plan_key)))
         if return_stats:
-            writes += [("plan_stats", name) for name in ("actions", "std", "cost")]
+            names = ["actions", "std", "cost", *(["violation"] if self._constrained else [])]
+            writes += [("plan_stats", name) for name in names]
         self.in_keys, self.out_keys = reads, writes
         if generator is None:
             generator = torch.Generator(self.low.device)
@@ -304,8 +314,8 @@ class Planner(MPCPlannerBase):
                 shifted = torch.cat([plan.actions[..., 1:, :], plan.actions[..., -1:, :]], dim=-2)
                 written.append(self._shaped(shifted))
             if self.return_stats:
-                cost = self._evaluate(state, plan.actions.unsqueeze(-3))
-                written += [self._shaped(plan.actions), self._shaped(plan.std), cost]
+                written += [self._shaped(plan.actions), self._shaped(plan.std)]
+                written += self._statistics(state, plan.actions.unsqueeze(-3))
         return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
 
     def plan(self, state: Any, proposal: Proposal) -> Plan:
@@ -329,6 +339,9 @@ class Planner(MPCPlannerBase):
             candidates = self._candidates(proposal, best)
             costs = self._evaluate(state, candidates)
             elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
+            if self._constrained:
+                feasible = elite_costs < REJECTED_COST
+                elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
             index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
             elites = candidates.gather(-3, index)
             found = elite_costs[..., 0].isfinite()[..., None, None]
@@ -355,6 +368,13 @@ class Planner(MPCPlannerBase):
             warnings.warn(
                 "no candidate plan has a finite cost in at least one row: its action is the mean "
                 "of the proposal; check the model, the cost and the input for nan and inf",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+        elif self._constrained and bool((plan.best_cost >= REJECTED_COST).any()):
+            warnings.warn(
+                "no candidate plan satisfies the chance constraints in at least one row: its plan is the "
+                "one of least violation; widen the search, or loosen delta",
                 RuntimeWarning,
                 stacklevel=3,
             )
@@ -403,8 +423,34 @@ class Planner(MPCPlannerBase):
             candidates[..., 1, :, :] = best
         return candidates
 
+    def _checked_sampling(self, asked: dict[str, Any]) -> bool:
+        """Refuse early what the environment cannot evaluate; true if there are constraints."""
+        source = self._source
+        if callable(getattr(type(source), "sampling", None)):
+            return bool(source.sampling(**asked).constraints)
+        if asked:
+            raise TypeError(
+                f"{' and '.join(asked)} need an environment whose objective takes them, as LatentEnv "
+                f"does, got {type(self.env).__name__}, whose own objective has no method sampling beside it"
+            )
+        return False
+
+    def _statistics(self, state: Any, plan: Tensor) -> list[Tensor]:
+        """Cost and, if there are constraints, probabilities of violation, from the same noise."""
+        noise = self._model_generator.get_state()
+        statistics = [self._evaluate(state, plan)]
+        if self._constrained:
+            self._model_generator.set_state(noise)
+            asked = _given({"num_samples": self.num_samples, "constraints": self.constraints})
+            generator = self._model_generator
+            frequency = self._source.violation_probability(state, plan, generator=generator, **asked)
+            statistics.append(frequency.squeeze(-2))
+        return statistics
+
     def _evaluate(self, state: Any, candidates: Tensor) -> Tensor:
-        costs = self._source.objective(state, candidates, generator=self._model_generator)
+        asked = _given({"num_samples": self.num_samples, "risk": self.risk, "constraints": self.constraints})
+        generator = self._model_generator
+        costs = self._source.objective(state, candidates, generator=generator, **asked)
         costs = costs.to(candidates.dtype)
         return torch.where(costs.isfinite(), costs, math.inf)
 
@@ -432,30 +478,6 @@ def _offspring(generator: torch.Generator, device: torch.device) -> torch.Genera
     return torch.Generator(device).manual_seed(int(seed))
 
 
-def _continuous(spec: TensorSpec | None, keys: list[NestedKey]) -> TensorSpec:
-    supported = "one continuous tensor (Bounded or Unbounded, floating point)"
-    if spec is None:
-        raise TypeError(f"the action of env must be {supported}, got the keys {keys}")
-    if not isinstance(spec, (Bounded, Unbounded)) or not spec.dtype.is_floating_point:
-        raise TypeError(f"the action of env must be {supported}, got {type(spec).__name__} of {spec.dtype}")
-    return spec
-
-
-def _gaussian_of_bounds(spec: TensorSpec, init_std: float | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Bounds, and mean and standard deviation of a proposal that knows nothing yet."""
-    low, high = spec.space.low.clone(), spec.space.high.clone()
-    limit = 0.5 * torch.finfo(low.dtype).max  # Unbounded has the largest number as its bound
-    bounded = (low > -limit) & (high < limit)
-    if bool((~(low < high)).any()):
-        raise ValueError(
-            "action bounds must satisfy low < high, got "
-            f"low={low.flatten().tolist()} and high={high.flatten().tolist()}"
-        )
-    if init_std is None and not bool(bounded.all()):
-        raise ValueError(
-            "init_std must be given, in units of the action, for an action without finite bounds, "
-            f"got None with low={low.flatten().tolist()} and high={high.flatten().tolist()}"
-        )
-    half_range = torch.where(bounded, 0.5 * high - 0.5 * low, 1.0)
-    middle = torch.where(bounded, 0.5 * high + 0.5 * low, torch.zeros_like(low).clamp(low, high))
-    return low, high, middle, half_range * (0.5 if init_std is None else init_std)
+def _given(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Those that are not None: the environment's own settings hold for the rest."""
+    return {name: value for name, value in arguments.items() if value is not None}

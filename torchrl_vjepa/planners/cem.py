@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchrl_vjepa.planners.base import Planner, Proposal
+from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.proposal import Proposal
 
 __all__ = ["CEM"]
 

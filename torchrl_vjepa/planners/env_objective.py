@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
+
+from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, plan_cost
 
 __all__ = ["EnvObjective"]
 
@@ -17,6 +21,10 @@ class EnvObjective:
     cost is minus the sum of rewards, where rewards after the first ``done`` do not count. Only the
     entries that the environment reads are kept, as views: nothing is copied per candidate before
     the first step. A ``done`` in the input is dropped, so the plan never starts from a reset state.
+
+    A stochastic environment can be sampled (``num_samples`` with a ``risk``): every trajectory is a row
+    of its batch. Its noise is its own, so it is not common to the candidates. Chance constraints are
+    refused: they read latents, which an environment does not have in general.
 
     Args:
         env: the environment; stochastic ones draw from their own random state.
@@ -86,8 +94,42 @@ class EnvObjective:
             )
         return tensordict.select(*self.in_keys)
 
+    def sampling(
+        self,
+        num_samples: int | None = None,
+        risk: Risk | None = None,
+        constraints: Sequence[ChanceConstraint] | None = None,
+    ) -> Sampling:
+        """How plans are evaluated where this is asked for.
+
+        Args:
+            num_samples: trajectories per plan; ``None``: one, whose cost is taken as it is.
+            risk: of their costs; ``None``: the expectation.
+            constraints: none is supported.
+
+        Returns:
+            The settings together.
+
+        Raises:
+            ValueError: if ``num_samples`` is not positive, or a risk has no samples to read.
+            TypeError: if ``risk`` is not callable, or constraints are given.
+        """
+        if constraints:
+            raise TypeError(
+                "constraints need an environment with latents, as LatentEnv, got "
+                f"{type(self.env).__name__}; put the violation into its reward, or use a LatentEnv"
+            )
+        return Sampling.checked(num_samples, risk, ())
+
     def objective(
-        self, state: TensorDictBase, actions: Tensor, *, generator: torch.Generator | None = None
+        self,
+        state: TensorDictBase,
+        actions: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+        num_samples: int | None = None,
+        risk: Risk | None = None,
+        constraints: Sequence[ChanceConstraint] | None = None,
     ) -> Tensor:
         """Minus the summed reward of candidate plans.
 
@@ -95,12 +137,28 @@ class EnvObjective:
             state: what :meth:`planning_state` returned, with batch size ``*B``.
             actions: candidate plans, of shape ``(*B, N, H, A)``.
             generator: not used: the environment draws from its own random state.
+            num_samples: trajectories per plan; ``None``: one, whose cost is taken as it is.
+            risk: of their costs; ``None``: the expectation.
+            constraints: none is supported.
 
         Returns:
             Costs of shape ``(*B, N)``.
+
+        Raises:
+            ValueError: if ``num_samples`` is not positive, or a risk has no samples to read.
+            TypeError: if ``risk`` is not callable, or constraints are given.
         """
+        num_samples, risk, _ = self.sampling(num_samples, risk, constraints)
+        state = state.unsqueeze(-1).expand(actions.shape[:-2])
+        if num_samples is None:
+            return self._stepped(state, actions)
+        state = state.expand(num_samples, *state.batch_size)
+        return plan_cost(self._stepped(state, actions.expand(num_samples, *actions.shape)), risk)
+
+    def _stepped(self, state: TensorDictBase, actions: Tensor) -> Tensor:
+        """Minus the summed reward of one plan per row: ``(*B)`` of ``(*B, H, A)``."""
         batch = actions.shape[:-2]
-        current = state.unsqueeze(-1).expand(batch)
+        current = state
         cost = actions.new_zeros(batch)
         alive = torch.ones(batch, dtype=torch.bool, device=actions.device)
         for action in actions.unbind(-2):

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Planner, Proposal
+from torchrl_vjepa.planners.base import Planner
 from torchrl_vjepa.planners.cem import weighted_gaussian
+from torchrl_vjepa.planners.proposal import Proposal
 
 __all__ = ["MPPI"]
 

@@ -7,7 +7,8 @@ from typing import Any
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Planner, Proposal
+from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.proposal import Proposal
 
 __all__ = ["RandomShooting"]
 

@@ -1,0 +1,178 @@
+"""Common random numbers: every family moves with its noise, and still has its own distribution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import (
+    Categorical,
+    Cauchy,
+    Distribution,
+    Independent,
+    Laplace,
+    LowRankMultivariateNormal,
+    MixtureSameFamily,
+    MultivariateNormal,
+    Normal,
+    StudentT,
+    TransformedDistribution,
+    Uniform,
+)
+from torch.distributions.transforms import AffineTransform, TanhTransform
+
+from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
+from torchrl_vjepa.distributions import Delta, diag_gaussian
+
+ROOT = torch.tensor([[1.0, 0.0], [0.7, 0.5]], dtype=torch.float64)
+
+
+def full(loc: Tensor) -> Distribution:
+    return MultivariateNormal(loc, scale_tril=ROOT, validate_args=False)
+
+
+def low_rank(loc: Tensor) -> Distribution:
+    return LowRankMultivariateNormal(
+        loc, ROOT[:, :1].expand(*loc.shape, 1), torch.full_like(loc, 0.3), validate_args=False
+    )
+
+
+def mixture(loc: Tensor) -> Distribution:
+    parts = diag_gaussian(torch.stack([loc - 1, loc + 2], -2), torch.full((2, 2), 0.3).double())
+    logits = torch.tensor([0.5, -0.5], dtype=torch.float64).expand(*loc.shape[:-1], 2)
+    return MixtureSameFamily(Categorical(logits=logits), parts, validate_args=False)
+
+
+def full_mixture(loc: Tensor) -> Distribution:
+    parts = MultivariateNormal(torch.stack([loc - 1, loc + 2], -2), scale_tril=ROOT, validate_args=False)
+    return MixtureSameFamily(Categorical(torch.ones(*loc.shape[:-1], 2).double()), parts, validate_args=False)
+
+
+def flow(loc: Tensor) -> Distribution:
+    return TransformedDistribution(
+        diag_gaussian(loc, torch.full_like(loc, 0.5)), [TanhTransform(), AffineTransform(1.0, 2.0)]
+    )
+
+
+def factor_flow(loc: Tensor) -> Distribution:
+    """A transform makes the event dimension: the base is a batch of scalars."""
+    return TransformedDistribution(Normal(loc, 0.5), [AffineTransform(1.0, 2.0, event_dim=1)])
+
+
+FAMILIES: dict[str, Callable[[Tensor], Distribution]] = {
+    "diagonal": lambda loc: diag_gaussian(loc, torch.full_like(loc, 0.5)),
+    "full": full,
+    "low_rank": low_rank,
+    "mixture": mixture,
+    "full_mixture": full_mixture,
+    "flow": flow,
+    "factor_flow": factor_flow,
+    "laplace": lambda loc: Independent(Laplace(loc, 0.5, validate_args=False), 1),
+    "uniform": lambda loc: Independent(Uniform(loc - 1, loc + 1, validate_args=False), 1),
+    "cauchy": lambda loc: Independent(Cauchy(loc, 0.5, validate_args=False), 1),
+}
+every_family = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+@every_family
+def test_equal_rows_get_equal_draws_and_samples_differ(family: Callable[[Tensor], Distribution]) -> None:
+    before = torch.get_rng_state()
+    draws = sample_common(family(torch.zeros(6, 2, 3, 2).double()), generator=generator())
+    assert draws.shape == (6, 2, 3, 2)
+    assert draws.dtype == torch.float64
+    assert (draws == draws[:, :1, :1]).all()
+    assert len(draws[:, 0, 0].unique(dim=0)) == 6
+    assert (draws[:, 0, 0, 0] != draws[:, 0, 0, 1]).any()  # components have noise of their own
+    assert torch.equal(before, torch.get_rng_state())
+    again = sample_common(family(torch.zeros(6, 1, 2).double()), generator=generator())
+    assert torch.equal(again[:, 0], draws[:, 0, 0]), "one row or many: the same noise"
+
+
+@every_family
+def test_draws_move_with_the_parameters(family: Callable[[Tensor], Distribution]) -> None:
+    loc = torch.tensor([[0.0, 0.0], [1e-6, 1e-6]]).double().expand(50, 2, 2)
+    draws = sample_common(family(loc), generator=generator())
+    assert ((draws[:, 1] - draws[:, 0]).abs() < 1e-5).all()
+
+
+@every_family
+def test_draws_have_the_distribution(family: Callable[[Tensor], Distribution]) -> None:
+    """Compared with its own sampler in mean and covariance of a bounded function."""
+    num = 20_000
+    p = family(torch.tensor([0.3, -0.2]).double().expand(num, 1, 2))
+    torch.manual_seed(1)
+    values = [torch.tanh(draw).squeeze(1) for draw in (sample_common(p, generator=generator()), p.sample())]
+    for moment in (lambda x: x, lambda x: torch.stack([x[:, 0] * x[:, 1], x[:, 0] ** 2], 1)):
+        one, two = (moment(x) for x in values)
+        error = ((one.var(0) + two.var(0)) / num).sqrt()
+        assert ((one.mean(0) - two.mean(0)).abs() < 5 * error).all()
+
+
+@every_family
+def test_gradient_reaches_the_parameters(family: Callable[[Tensor], Distribution]) -> None:
+    loc = torch.zeros(4, 3, 2, dtype=torch.float64, requires_grad=True)
+
+    def draw(value: Tensor) -> Tensor:
+        return sample_common(family(value), generator=generator())
+
+    assert torch.autograd.gradcheck(draw, loc)
+
+
+def test_a_point_mass_is_itself() -> None:
+    loc = torch.randn(4, 3, 2, requires_grad=True)
+    draw = sample_common(Delta(loc), generator=generator())
+    assert torch.equal(draw, loc)
+    assert draw.requires_grad
+
+
+def test_other_families_are_drawn_independently() -> None:
+    p = Independent(StudentT(torch.full((5, 3, 2), 4.0), validate_args=False), 1, validate_args=False)
+    draws = sample_common(p, generator=generator())
+    assert draws.shape == (5, 3, 2)
+    assert len(draws.flatten(0, 1).unique(dim=0)) == 15
+    assert torch.equal(draws, sample_common(p, generator=generator()))
+
+
+def test_a_family_of_ones_own_can_join() -> None:
+    class Shifted(Normal):
+        pass
+
+    @sample_common.register(Shifted)
+    def _(p: Shifted, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
+        return p.loc + 100.0
+
+    p = Independent(Shifted(torch.zeros(4, 3, 2), 1.0), 1)
+    assert (sample_common(p) == 100.0).all()
+
+
+def test_without_generator_the_global_state_is_read() -> None:
+    p = mixture(torch.zeros(6, 3, 2).double())
+    torch.manual_seed(3)
+    one = sample_common(p)
+    torch.manual_seed(3)
+    assert torch.equal(one, sample_common(p))
+    assert not torch.equal(one, sample_common(p))
+
+
+def test_no_batch_beside_the_samples() -> None:
+    for family in FAMILIES.values():
+        assert sample_common(family(torch.zeros(6, 2).double()), generator=generator()).shape == (6, 2)
+
+
+def test_the_comparison_of_two_plans_loses_its_noise() -> None:
+    """What common random numbers are for: the variance of a difference of costs."""
+
+    def walk(latent: Tensor, action: Tensor) -> Distribution:
+        return mixture(latent + action)
+
+    latent = torch.zeros(500, 2, 2).double()
+    action = torch.tensor([[0.0, 0.0], [0.1, 0.1]]).double().expand(500, 2, 2)
+    common = CommonNoise(walk, generator())(latent, action).mean.square().sum(-1)
+    alone = walk(latent, action).sample().square().sum(-1)
+    assert (common[:, 0] - common[:, 1]).var() < 0.05 * (alone[:, 0] - alone[:, 1]).var()

@@ -1,0 +1,229 @@
+"""One imagined step: the transition and what it costs, on tensors and on tensordicts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torch.distributions import Distribution
+
+from torchrl_vjepa.belief import Transition
+from torchrl_vjepa.costs import StageCost
+from torchrl_vjepa.distributions import point_estimate
+
+__all__ = ["LatentStep"]
+
+
+class LatentStep(TensorDictModuleBase):
+    """``latent, action -> next latent -> reward``, on tensors and on tensordicts.
+
+    Args:
+        predictor: owns the parameters of ``transition``.
+        transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
+        reward_model: reads next latent and action, writes the reward; or ``None``.
+        cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``, where there is no reward model.
+        how: which latent of the distribution comes next.
+        action_shape: shape of one action.
+        latent_key: where the latent is.
+        action_key: where the action is.
+        reward_key: where the reward is written.
+
+    Raises:
+        TypeError: if the reward model is no TensorDictModule.
+        KeyError: if it reads or writes other keys.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> def move(latent, action):
+        ...     return Delta(latent + action)
+        >>> step = LatentStep(
+        ...     None, move, None, quadratic_cost(torch.zeros(2)), "mean", torch.Size([2]),
+        ...     latent_key="latent", action_key="action", reward_key="reward",
+        ... )
+        >>> step(TensorDict(latent=torch.ones(2), action=torch.ones(2)))["reward"]
+        tensor([-8.])
+    """
+
+    def __init__(
+        self,
+        predictor: Any,
+        transition: Transition,
+        reward_model: TensorDictModuleBase | None,
+        cost: StageCost | None,
+        how: Literal["mean", "mode", "sample"],
+        action_shape: torch.Size,
+        *,
+        latent_key: NestedKey,
+        action_key: NestedKey,
+        reward_key: NestedKey,
+    ) -> None:
+        super().__init__()
+        self.predictor = predictor  # registered: its parameters move and synchronise with the env
+        self.transition = transition
+        self.reward_model: Any = reward_model
+        self.cost = cost
+        self.how = how
+        self.action_shape = tuple(action_shape)
+        self.action_dim = math.prod(action_shape)
+        self.latent_key, self.action_key = unravel_key(latent_key), unravel_key(action_key)
+        self.reward_key = reward_key
+        self.in_keys = [self.latent_key, self.action_key]
+        self.out_keys = [self.latent_key, self.reward_key]
+        self.reward_calls_tensors = False
+        if reward_model is not None:
+            if not isinstance(reward_model, TensorDictModuleBase):
+                raise TypeError(
+                    "reward_model must be a TensorDictModule, for instance TensorDictModule("
+                    "QuadraticReward(D, A), ['latent', 'action'], ['reward']), got "
+                    f"{type(reward_model).__name__}"
+                )
+            reads = [unravel_key(key) for key in reward_model.in_keys]
+            if not set(reads) <= set(self.in_keys):
+                raise KeyError(
+                    f"reward_model must read only latent_key={self.latent_key!r} and "
+                    f"action_key={self.action_key!r}, got in_keys={reads}; rename its in_keys"
+                )
+            if self.reward_key not in [unravel_key(key) for key in reward_model.out_keys]:
+                raise KeyError(
+                    f"reward_model must write reward_key={self.reward_key!r}, "
+                    f"got out_keys={list(reward_model.out_keys)}"
+                )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the next latent and the reward.
+
+        Args:
+            tensordict: holds latent and action.
+
+        Returns:
+            The same tensordict.
+        """
+        return tensordict.update(self.step(tensordict, None))
+
+    def step(self, tensordict: TensorDictBase, generator: torch.Generator | None) -> TensorDictBase:
+        """Next latent and reward, and nothing else of the input.
+
+        Args:
+            tensordict: holds latent and action.
+            generator: source of randomness for ``how="sample"``.
+
+        Returns:
+            A new tensordict of the same batch size.
+        """
+        # A new tensordict: no stale done or reward of the input passes through.
+        latent = tensordict.get(self.latent_key)
+        action = tensordict.get(self.action_key)
+        action = action.reshape((*latent.shape[:-1], self.action_dim)).to(latent.dtype)
+        p = self.transition(latent, action)
+        latent = point_estimate(p, self.how, generator=generator)
+        reward = -self.stage_cost(latent, action).unsqueeze(-1)
+        out = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
+        return out.set(self.latent_key, latent).set(self.reward_key, reward)
+
+    def stage_cost(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Costs of next latents and the actions that led there, all at once.
+
+        Args:
+            latent: of shape ``(*B, D)``.
+            action: flat, of shape ``(*B, A)``.
+
+        Returns:
+            Of shape ``(*B)``.
+
+        Raises:
+            ValueError: if the cost or the reward model returns another shape.
+        """
+        if self.cost is not None:
+            return _checked_shape(self.cost(latent, action), latent.shape[:-1], "cost")
+        batch = latent.shape[:-1]
+        shaped = action.reshape((*batch, *self.action_shape))
+        if self.reward_calls_tensors:
+            reward = self._reward_of_tensors(latent, shaped)
+        else:
+            reward = self._reward_of_tensordict(latent, shaped)
+        return -_checked_shape(reward, (*batch, 1), "reward_model").squeeze(-1)
+
+    def probe(
+        self, latent_dim: int, action_dim: int, device: torch.device | None, dtype: torch.dtype
+    ) -> None:
+        """Call every part on a small block, in evaluation mode, so that errors come early.
+
+        Args:
+            latent_dim: size of the latent.
+            action_dim: numbers in an action.
+            device: of the block.
+            dtype: of the block.
+
+        Raises:
+            ValueError: if a part returns a wrong shape.
+            TypeError: if the transition returns no distribution.
+        """
+        batch = (2, 3)
+        latent = torch.linspace(-1.0, 1.0, 6 * latent_dim, device=device, dtype=dtype)
+        latent = latent.reshape(*batch, latent_dim)
+        action = torch.linspace(-0.9, 1.1, 6 * action_dim, device=device, dtype=dtype)
+        action = action.reshape(*batch, action_dim)
+        training = [module for module in self.modules() if module.training]
+        for module in training:
+            module.training = False
+        try:
+            with torch.no_grad():
+                self._probe(latent, action)
+        finally:
+            for module in training:
+                module.training = True
+
+    def _probe(self, latent: Tensor, action: Tensor) -> None:
+        batch = latent.shape[:-1]
+        p = self.transition(latent, action)
+        if not isinstance(p, Distribution):
+            raise TypeError(
+                "model must return a torch Distribution over the next latent, got "
+                f"{type(p).__name__}; wrap a point prediction in Delta"
+            )
+        if tuple(p.batch_shape) != batch or tuple(p.event_shape) != latent.shape[-1:]:
+            raise ValueError(
+                f"model must return a distribution with batch shape {tuple(batch)} and event shape "
+                f"{tuple(latent.shape[-1:])} for latent {tuple(latent.shape)} and action "
+                f"{tuple(action.shape)}, got {tuple(p.batch_shape)} and {tuple(p.event_shape)}"
+            )
+        first = self.stage_cost(latent, action)
+        model = self.reward_model
+        if (
+            type(model) is TensorDictModule
+            and isinstance(model.module, nn.Module)
+            and list(map(unravel_key, model.out_keys)) == [self.reward_key]
+        ):
+            # A plain network needs no tensordict per call, provided that it says the same.
+            try:
+                second = self._reward_of_tensors(latent, action.reshape((*batch, *self.action_shape)))
+                self.reward_calls_tensors = torch.equal(second.squeeze(-1), -first)
+            except (TypeError, RuntimeError, ValueError):  # keyword inputs, for instance
+                self.reward_calls_tensors = False
+
+    def _reward_of_tensors(self, latent: Tensor, action: Tensor) -> Tensor:
+        model = self.reward_model
+        inputs = {self.latent_key: latent, self.action_key: action}
+        return model.module(*(inputs[unravel_key(key)] for key in model.in_keys))
+
+    def _reward_of_tensordict(self, latent: Tensor, action: Tensor) -> Tensor:
+        inputs = TensorDict({}, batch_size=latent.shape[:-1], device=latent.device)
+        inputs.set(self.latent_key, latent).set(self.action_key, action)
+        return self.reward_model(inputs).get(self.reward_key)
+
+
+def _checked_shape(value: Tensor, expected: tuple[int, ...], name: str) -> Tensor:
+    if not isinstance(value, Tensor) or tuple(value.shape) != tuple(expected):
+        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(
+            f"{name} must return a tensor of shape {tuple(expected)} for the batch "
+            f"{tuple(expected)[: None if name != 'reward_model' else -1]}, got {got}"
+        )
+    return value
