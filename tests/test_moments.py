@@ -210,6 +210,20 @@ def test_singular_and_shared_covariances(method: Any) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_units_of_the_dimensions_do_not_matter(method: Any) -> None:
+    """In float32, with standard deviations from a hundred down to a hundredth."""
+    units = torch.tensor([100.0, 1.0, 0.01])
+
+    def transition(latent: Tensor, action: Tensor) -> Distribution:
+        return diag_gaussian(latent, 0.1 * units)
+
+    covariance = torch.diag(units.square())
+    actions = torch.zeros(2, 0)
+    _, covariances = propagate_moments(transition, torch.zeros(3), actions, method, covariance=covariance)
+    torch.testing.assert_close(covariances[-1] / units / units.unsqueeze(-1), 1.02 * torch.eye(3))
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_gradients_and_vmap(method: Any) -> None:
     predictor = Predictor(D, A, trunk="mlp", num_cells=(8,)).double()
     latent, _, actions = problem(2)

@@ -172,10 +172,10 @@ def _cubature(
 
 
 def _factor(covariance: Tensor) -> Tensor:
-    """Lower factor of a covariance that may be singular: a variance at rounding level is added."""
+    """Lower factor of a covariance that may be singular: each variance grows by a rounding error."""
     finfo = torch.finfo(covariance.dtype)
-    trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-    jitter = (4 * finfo.eps * trace + finfo.tiny).unsqueeze(-1).expand(covariance.shape[:-1])
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    jitter = 4 * covariance.shape[-1] * finfo.eps * variance + finfo.tiny
     factor, failed = torch.linalg.cholesky_ex(covariance + torch.diag_embed(jitter))
     # A transition's covariance that is none must not pass for one.
     return torch.where((failed == 0)[..., None, None], factor, torch.nan)
