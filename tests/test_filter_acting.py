@@ -257,6 +257,19 @@ def test_rows_start_by_themselves() -> None:
     assert out[1:].std(1).min() > 0.1
 
 
+def test_weights_are_carried_past_the_reset_of_another_row() -> None:
+    predictor = Predictor(D, action_dim=1, head=DiagGaussianHead("constant"))
+    run = make_filter(VJEPA(linear_encoder(3, D), predictor), resample_threshold=0.0)
+    log_weights = torch.full((2, K), -math.inf)
+    log_weights[:, 2] = 0.0
+    memory = TensorDict(particles=torch.zeros(2, K, D), log_weights=log_weights, action=torch.zeros(2, 1))
+    is_init = torch.tensor([[True], [False]])
+    td = TensorDict(latent=torch.zeros(2, D), belief=memory, is_init=is_init, batch_size=[2])
+    out = run(td)["next", "belief", "log_weights"]
+    assert out[0].isfinite().all()
+    assert torch.equal(out[1], log_weights[1])
+
+
 def test_the_filter_steers_the_noisy_tv() -> None:
     """Kalman filter against particles with the true model: the same controller, nearly the same cost."""
     noise_scale = 1.0
