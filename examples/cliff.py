@@ -87,18 +87,18 @@ class Settings:
     level: float = option(0.05, "tail of CVaR, and bound on the probability of a fall within the horizon")
     planning_horizon: int = option(6, "steps that are imagined")
     optim_steps: int = option(3, "CEM rounds for each action")
-    num_candidates: int = option(32, "plans in a round")
+    num_candidates: int = option(64, "plans in a round")
     num_samples: int = option(60, "imagined trajectories of each plan")
-    episodes: int = option(100, "evaluation episodes, the same gusts for every planner")
+    episodes: int = option(60, "evaluation episodes, the same gusts for every planner")
     steps: int = option(16, "steps in an episode")
 
 
 QUICK = {
     "frames": 4_000,
-    "train_steps": 150,
-    "num_candidates": 24,
-    "num_samples": 24,
-    "episodes": 20,
+    "train_steps": 100,
+    "num_candidates": 16,
+    "num_samples": 20,
+    "episodes": 10,
     "optim_steps": 2,
 }
 

@@ -131,6 +131,13 @@ class TestObjective:
         )
         assert (spread.objective(state, actions) > 0.1).all()
 
+    def test_mixtures_share_their_random_numbers_too(self) -> None:
+        env = make_env(bimodal)
+        generator = torch.Generator().manual_seed(0)
+        actions = torch.full((4, 6, 5, 2), 0.3)
+        costs = env.objective(torch.ones(4, 2), actions, generator=generator, num_samples=3)
+        assert (costs == costs[0, 0]).all()
+
     def test_other_distributions_are_sampled_too(self) -> None:
         env = make_env(bimodal, how="sample", num_samples=4000, cost=quadratic_cost(torch.zeros(2)))
         before = torch.get_rng_state()

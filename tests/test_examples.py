@@ -42,6 +42,15 @@ TABLE_KEYS = {
     "noise_r2",
     "train_s",
 }
+CLIFF_KEYS = {
+    "model",
+    "planner",
+    "seed",
+    "mean_cost",
+    "worst_5_percent",
+    "fall_rate",
+    "success_rate",
+}
 # "path:line: Category: message", raised at a line of this repository
 WARNING = re.compile(r"\S*(?:torchrl_vjepa|examples)/\S*\.py:\d+: \w*Warning: .*")
 
@@ -163,10 +172,32 @@ def check_surprise_report(report: dict[str, Any]) -> None:
             assert row["surprise_after"] > row["surprise_before"]
 
 
+def check_cliff_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``cliff.py``: its keys, its ranges, and one row for each planner and model."""
+    assert set(report) == {"settings", "wall_s", "rows"}
+    assert report["wall_s"] > 0
+    rows = report["rows"]
+    cells = [(row["model"], row["planner"], row["seed"]) for row in rows]
+    expected = {
+        (model, planner, seed)
+        for model in ("VJEPA", "true")
+        for planner in ("mean", "expectation", "cvar", "chance")
+        for seed in report["settings"]["seeds"]
+    }
+    assert len(cells) == len(expected)
+    assert set(cells) == expected
+    for row in rows:
+        assert set(row) == CLIFF_KEYS
+        assert 0 < row["mean_cost"] <= row["worst_5_percent"] * (1 + 1e-6)
+        assert 0 <= row["fall_rate"] <= 1
+        assert 0 <= row["success_rate"] <= 1 - row["fall_rate"] + 1e-6
+
+
 CHECKS = {
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,
     "surprise": check_surprise_report,
+    "cliff": check_cliff_report,
 }
 
 

@@ -42,6 +42,15 @@ from torchrl_vjepa.planners import (
     Proposal,
     RandomShooting,
 )
+from torchrl_vjepa.risk import (
+    REJECTED_COST,
+    ChanceConstraint,
+    cvar,
+    entropic,
+    expectation,
+    mean_variance,
+    worst_case,
+)
 
 PLANNERS = [RandomShooting, CEM, MPPI]
 REFINING = [CEM, MPPI]
@@ -930,3 +939,255 @@ class TestEnvObjective:
     def test_missing_state_is_named(self) -> None:
         with pytest.raises(KeyError, match=r"WrapperEnv needs the entries .*missing \['latent'\]"):
             CEM(WrapperEnv(), 3)(TensorDict(pixels=torch.zeros(3)))
+
+    def test_a_deterministic_environment_has_no_risk(self) -> None:
+        objective = EnvObjective(WrapperEnv())
+        state, actions = objective.planning_state(states(3)), torch.randn(3, 5, 4, 2)
+        plain = objective.objective(state, actions)
+        for risk in (None, cvar(0.3), worst_case):
+            sampled = objective.objective(state, actions, num_samples=4, risk=risk)
+            torch.testing.assert_close(sampled, plain)
+
+    def test_a_stochastic_environment_is_sampled(self) -> None:
+        """One step with noise of std 1: E|1 + w - 1|^2 = 2, the worst of many is worse."""
+        env = NoisyEnv()
+        objective = EnvObjective(env)
+        state = TensorDict(latent=torch.zeros(2))
+        torch.manual_seed(0)
+        plan = torch.linalg.solve(B_MATRIX, torch.ones(2)).reshape(1, 1, 2)
+        mean = objective.objective(state, plan, num_samples=4000)
+        assert abs(float(mean) - 2) < 5 * 2 / 4000**0.5
+        assert objective.objective(state, plan, num_samples=4000, risk=worst_case) > 8
+        action = CEM(env, 1, 8, num_samples=32, risk=cvar(0.5), seed=0)(state)["action"]
+        torch.testing.assert_close(action, plan.flatten(), atol=0.6, rtol=0)
+
+    def test_constraints_are_refused(self) -> None:
+        constraint = ChanceConstraint(_first_positive, 0.1)
+        with pytest.raises(TypeError, match="constraints need an environment with latents.*WrapperEnv"):
+            CEM(WrapperEnv(), 3, num_samples=8, constraints=[constraint])
+
+
+class NoisyEnv(WrapperEnv):
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        out = super()._step(tensordict)
+        latent = out["latent"] + torch.randn_like(out["latent"])
+        return out.set("latent", latent).set("reward", -(latent - 1).square().sum(-1, keepdim=True))
+
+
+def _first_positive(latent: Tensor, action: Tensor) -> Tensor:
+    return latent[..., 0] > 0
+
+
+def gusty(latent: Tensor, action: Tensor) -> torch.distributions.Distribution:
+    """The latent is the action; the noise grows with it."""
+    return diag_gaussian(action, 0.02 + 0.5 * action.clamp_min(0))
+
+
+def gusty_env(**kwargs: Any) -> LatentEnv:
+    """It is good to go far: the cost is minus the latent, and a fall beyond 1 costs 2 more."""
+    return LatentEnv(gusty, action_spec=Bounded(-1, 1, (1,)), cost=_Far(), latent_dim=1, **kwargs)
+
+
+class _Far:
+    def __call__(self, latent: Tensor, action: Tensor) -> Tensor:
+        return -latent[..., 0] + 2.0 * (latent[..., 0] > 1)
+
+
+def beyond_one(latent: Tensor, action: Tensor) -> Tensor:
+    return latent[..., 0] > 1
+
+
+RISKS = [expectation, mean_variance(0.5), cvar(0.2), entropic(1.0), worst_case]
+
+
+class TestRisk:
+    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("risk", RISKS)
+    def test_of_the_planner_equals_that_of_the_environment(self, cls: type[Planner], risk: Any) -> None:
+        settings = {"planning_horizon": 2, "num_candidates": 32, "seed": 0}
+        one = cls(lqr_env(model=noisy), **settings, num_samples=16, risk=risk)(states(3))
+        env = lqr_env(model=noisy, how="sample", num_samples=16, risk=risk)
+        two = cls(env, **settings)(states(3))
+        assert torch.equal(one["action"], two["action"])
+
+    def test_the_planner_replaces_what_it_names_and_nothing_else(self) -> None:
+        env = lqr_env(model=noisy, how="sample", num_samples=8, risk=worst_case)
+        state, actions = states(3)["latent"], torch.randn(3, 5, 2, 2)
+
+        def cost(**asked: Any) -> Tensor:
+            return env.objective(state, actions, generator=torch.Generator().manual_seed(0), **asked)
+
+        assert torch.equal(cost(), cost(num_samples=8, risk=worst_case))
+        torch.testing.assert_close(cost(risk=expectation), cost(num_samples=8, risk=cvar(1.0)))
+        assert not torch.equal(cost(), cost(num_samples=9))
+        assert (cost() >= cost(risk=cvar(0.5))).all()
+        assert (cost(risk=cvar(0.5)) >= cost(risk=expectation)).all()
+
+    @pytest.mark.parametrize("cls", REFINING)
+    def test_the_more_averse_the_more_careful(self, cls: type[Planner]) -> None:
+        td = TensorDict(latent=torch.zeros(1))
+        settings = {"planning_horizon": 1, "optim_steps": 8, "num_candidates": 128, "seed": 0}
+        actions = [
+            float(cls(gusty_env(), **settings, num_samples=256, risk=risk)(td.clone())["action"])
+            for risk in (None, cvar(0.5), cvar(0.05))
+        ]
+        mean = float(cls(gusty_env(), **settings)(td.clone())["action"])
+        assert mean > 0.95
+        assert mean > actions[0] > actions[1] > actions[2]
+
+    def test_one_bad_trajectory_makes_a_plan_the_last(self) -> None:
+        env = reach_env(0.0, Bounded(-1, 1, (1,)), _BadAbove(math.nan, 0.0))
+        costs = env.objective(
+            torch.zeros(1), torch.tensor([0.5, -0.5]).reshape(2, 1, 1), num_samples=4, risk=cvar(0.3)
+        )
+        assert costs.isfinite().tolist() == [False, True]
+
+    def test_survives_pickle(self) -> None:
+        planner = CEM(
+            gusty_env(),
+            1,
+            num_samples=16,
+            risk=cvar(0.2),
+            constraints=[ChanceConstraint(beyond_one, 0.4)],
+            seed=0,
+        )
+        td = TensorDict(latent=torch.zeros(1))
+        other = pickle.loads(pickle.dumps(planner))
+        assert torch.equal(planner(td.clone())["action"], other(td.clone())["action"])
+
+    @pytest.mark.parametrize(
+        ("kwargs", "error", "message"),
+        [
+            ({"num_samples": 0}, ValueError, "num_samples must be an integer of at least 1, got 0"),
+            ({"risk": cvar(0.1)}, ValueError, "risk must have sampled trajectories"),
+            ({"num_samples": 4, "risk": 0.1}, TypeError, "risk must be callable"),
+            (
+                {"constraints": [ChanceConstraint(beyond_one, 0.1)]},
+                ValueError,
+                "constraints must have sampled trajectories",
+            ),
+            ({"num_samples": 4, "constraints": [beyond_one]}, TypeError, "sequence of ChanceConstraint"),
+        ],
+    )
+    def test_bad_arguments_are_refused_at_construction(
+        self, kwargs: dict[str, Any], error: type[Exception], message: str
+    ) -> None:
+        with pytest.raises(error, match=message):
+            CEM(gusty_env(), 1, **kwargs)
+        if "num_samples" not in kwargs:
+            with pytest.raises(error, match=message):
+                gusty_env(**kwargs)
+
+    def test_an_objective_without_risk_is_named(self) -> None:
+        env = GeneratorSpy()
+        with pytest.raises(TypeError, match=r"num_samples and risk need an environment .* got OwnObjective"):
+            CEM(OwnObjective(), 2, num_samples=4, risk=cvar(0.5))
+        assert CEM(env, 2, num_samples=None).risk is None
+
+
+class OwnObjective(WrapperEnv):
+    def objective(self, state: Any, actions: Tensor, *, generator: Any = None) -> Tensor:
+        return actions.sum(dim=(-1, -2))
+
+
+class TestChanceConstraints:
+    SETTINGS = {"planning_horizon": 1, "optim_steps": 8, "num_candidates": 128, "seed": 0}  # noqa: RUF012
+
+    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("delta", [0.0, 0.01, 0.03])
+    def test_the_best_plan_meets_the_bound(self, cls: type[Planner], delta: float) -> None:
+        """P(N(u, 0.02 + u / 2) > 1) <= delta, up to the error of 512 samples; and no more careful."""
+        constraint = ChanceConstraint(beyond_one, delta)
+        planner = cls(gusty_env(), **self.SETTINGS, num_samples=512, constraints=[constraint])
+        state = torch.zeros(1)
+        plan = planner.plan(state, Proposal(*(part[0] for part in cold(planner, 1))))
+        assert plan.best_cost < REJECTED_COST
+        u = float(plan.best)
+        tail = 1 - torch.distributions.Normal(u, 0.02 + 0.5 * u).cdf(torch.tensor(1.0))
+        error = 5 * (max(delta, 1 / 512) / 512) ** 0.5
+        assert tail < delta + error
+        assert tail > delta - error
+        assert u < 0.53, "the risk-neutral optimum is at 0.56: the constraint binds"
+
+    def test_penalty_moves_the_plan_as_far_as_it_pays(self) -> None:
+        td = TensorDict(latent=torch.zeros(1))
+        actions = []
+        for penalty in (0.1, 10.0, 1000.0):
+            constraint = ChanceConstraint(beyond_one, 0.01, penalty=penalty)
+            planner = CEM(gusty_env(), **self.SETTINGS, num_samples=512, constraints=[constraint])
+            actions.append(float(planner(td.clone())["action"]))
+        assert actions[0] > actions[1] + 0.02
+        rejecting = ChanceConstraint(beyond_one, 0.01)
+        planner = CEM(gusty_env(), **self.SETTINGS, num_samples=512, constraints=[rejecting])
+        assert abs(float(planner(td.clone())["action"]) - actions[2]) < 0.05
+
+    @pytest.mark.parametrize("cls", PLANNERS)
+    def test_where_nothing_is_feasible_the_least_violation_is_taken(self, cls: type[Planner]) -> None:
+        constraint = ChanceConstraint(_not_very_negative, 0.0)
+        env = LatentEnv(noisy_copy, action_spec=Bounded(-1, 1, (1,)), cost=_Far(), latent_dim=1)
+        planner = cls(env, **self.SETTINGS, num_samples=64, constraints=[constraint], return_stats=True)
+        with pytest.warns(RuntimeWarning, match="no candidate plan satisfies the chance constraints"):
+            out = planner(TensorDict(latent=torch.zeros(1)))
+        assert float(out["action"]) < -0.8
+        assert out["action"].isfinite().all()
+        assert out["plan_stats", "cost"] >= REJECTED_COST
+        assert 0 < float(out["plan_stats", "violation"]) < 1
+
+    @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+    def test_statistics_tell_the_probability(self, batch: tuple[int, ...]) -> None:
+        constraints = [ChanceConstraint(beyond_one, 0.3), ChanceConstraint(_first_positive, 0.9)]
+        planner = CEM(
+            gusty_env(), 1, 2, 32, num_samples=64, constraints=constraints, return_stats=True, seed=0
+        )
+        assert ("plan_stats", "violation") in planner.out_keys
+        out = planner(TensorDict(latent=torch.zeros(*batch, 1), batch_size=batch))
+        assert out["plan_stats", "violation"].shape == (*batch, 2)
+        assert ("plan_stats", "violation") not in CEM(gusty_env(), 1, return_stats=True).out_keys
+
+    def test_constraints_of_the_environment_can_be_lifted(self) -> None:
+        constraint = ChanceConstraint(beyond_one, 0.01)
+        env = gusty_env(how="sample", num_samples=256, constraints=[constraint])
+        td = TensorDict(latent=torch.zeros(1))
+        bound = float(CEM(env, **self.SETTINGS)(td.clone())["action"])
+        free = float(CEM(env, **self.SETTINGS, constraints=[])(td.clone())["action"])
+        assert bound + 0.02 < free
+
+    def test_rejected_plans_have_no_part_beside_a_feasible_one(self) -> None:
+        seen: list[Tensor] = []
+
+        class Spy(CEM):
+            def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
+                seen.append(costs)
+                return super().update(proposal, elites, costs)
+
+        constraint = ChanceConstraint(beyond_one, 0.05)
+        planner = Spy(gusty_env(), 1, 1, 32, 32, num_samples=64, constraints=[constraint], seed=0)
+        planner(TensorDict(latent=torch.zeros(1)))
+        assert seen[0].isfinite().any()
+        assert seen[0].isinf().any()
+        assert (seen[0][seen[0].isfinite()] < REJECTED_COST).all()
+
+    def test_a_learned_constraint_moves_with_the_environment(self) -> None:
+        network = nn.Linear(1, 1)
+        constraint = ChanceConstraint(_Probability(network), 0.05)
+        env = gusty_env(how="sample", num_samples=8, constraints=[constraint])
+        assert network.weight in set(env.parameters())
+        with pytest.raises(ValueError, match="constraints must hold at least one"):
+            gusty_env(how="sample").violation_probability(torch.zeros(1), torch.zeros(2, 1, 1))
+
+
+class _Probability(nn.Module):
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return self.network(latent).squeeze(-1)
+
+
+def noisy_copy(latent: Tensor, action: Tensor) -> torch.distributions.Distribution:
+    return diag_gaussian(action, torch.full_like(action, 0.3))
+
+
+def _not_very_negative(latent: Tensor, action: Tensor) -> Tensor:
+    return latent[..., 0] > -0.9

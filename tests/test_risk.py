@@ -459,6 +459,9 @@ class TestPlanCost:
         torch.testing.assert_close(one[:2], torch.tensor([1.0, 3.0]))
         two = plan_cost(torch.ones(4, 3), expectation, [reject, reject], latents, actions)
         assert two[2] > one[2] >= REJECTED_COST
+        loose = ChanceConstraint(above_one, 0.9)
+        for both in ([reject, loose], [loose, reject]):
+            assert plan_cost(torch.ones(4, 3), expectation, both, latents, actions)[2] >= REJECTED_COST
 
     def test_broken_plans_rank_after_rejected_ones(self) -> None:
         latents, actions = trajectories()
