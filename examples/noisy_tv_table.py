@@ -23,7 +23,6 @@ from typing import Any
 import matplotlib as mpl
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
@@ -113,22 +112,24 @@ class Settings:
     )
     train_length: int = option(6000, "steps of the training trajectory")
     test_length: int = option(2000, "steps of the test trajectory")
-    steps: int = option(0, "optimiser steps; 0 is 6000 (paper), 400 or with mlp 500 (robust)")
+    steps: int = option(0, "optimiser steps; 0 is 6000 (paper) or 100 (robust: of the last round)")
     r2: str = option(
         "uniform",
         "average over components: uniform (the paper's numbers) or weighted by variance (its formula)",
         choices=["uniform", "weighted"],
     )
-    restarts: int = option(6, "robust: starts trained side by side; the objective chooses one")
-    skips: list[int] = option([1, 4, 16], "robust: prediction steps that are learned together")
-    skip_weights: list[float] = option([0.1, 0.3, 0.6], "robust: their weights")
+    restarts: int = option(8, "robust: starts of each run; the objective chooses among them")
+    finalists: int = option(2, "robust: starts that the objective lets into the last round")
+    heat_steps: int = option(75, "robust: optimiser steps of the first round, which all starts train")
+    skips: list[int] = option([1, 8, 16], "robust: prediction steps that are learned together")
+    skip_weights: list[float] = option([0.04, 0.48, 0.48], "robust: their weights")
     window: int = option(20, "robust: steps in a window, more than the largest skip")
     windows: int = option(24, "robust: windows in a batch")
-    lr: float = option(0.0, "peak learning rate; 0 is 0.001 (paper), 0.2 or with mlp 0.1 (robust)")
+    lr: float = option(0.0, "peak learning rate; 0 is 0.001 (paper) or 0.3 (robust)")
     workers: int = option(2, "processes; each trains with one thread")
 
 
-QUICK = {"noise_scales": [0.0, 8.0], "restarts": 3, "steps": 150, "workers": 1}
+QUICK = {"noise_scales": [0.0, 8.0], "restarts": 3, "workers": 1}
 
 
 @dataclass
@@ -178,19 +179,6 @@ class Run:
         return whitening(train), whitening(test)
 
 
-class LinearPlusMLP(nn.Module):
-    """A linear map, which finds the predictable directions, and a small MLP, which bends it."""
-
-    def __init__(self, observation_dim: int, latent_dim: int, width: int = 32) -> None:
-        super().__init__()
-        self.linear = nn.Linear(observation_dim, latent_dim, bias=False)
-        self.mlp = nn.Sequential(nn.Linear(observation_dim, width), nn.SiLU(), nn.Linear(width, latent_dim))
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Latents of the same batch shape."""
-        return self.linear(observation) + self.mlp(observation)
-
-
 # The models and losses of the two presets
 
 
@@ -209,8 +197,10 @@ def paper_model(name: str, settings: Settings) -> Any:
     if name == "JEPA":
         return JEPA(encoder, Predictor(latent_dim, head=DeltaHead()))
     model = {"VJEPA": VJEPA, "BJEPA": BJEPA}[name]
-    target_scale = TargetScale(latent_dim, observation_dim, kind="linear")
-    return model(encoder, Predictor(latent_dim), target_scale=target_scale)
+    # Log-variances without bounds, as printed.
+    target_scale = TargetScale(latent_dim, observation_dim, kind="linear", log_var_range=None)
+    head = DiagGaussianHead(log_var_range=None)
+    return model(encoder, Predictor(latent_dim, head=head), target_scale=target_scale)
 
 
 def paper_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowLoss:
@@ -241,10 +231,10 @@ def robust_model(name: str, settings: Settings) -> Any:
         encoder = linear_encoder(observation_dim, latent_dim)
         linear = encoder.module.network
     else:
-        network = LinearPlusMLP(observation_dim, latent_dim)
-        encoder = TensorDictModule(network, in_keys=["observation"], out_keys=["latent"])
-        linear = network.linear
-        nn.init.normal_(network.mlp[-1].weight, std=0.1 / network.mlp[-1].in_features ** 0.5)
+        encoder = mlp_encoder(observation_dim, latent_dim, num_cells=(32,), residual=True)
+        linear = encoder.module.network.linear
+        output = encoder.module.network.mlp[-1]
+        nn.init.normal_(output.weight, std=0.1 / output.in_features**0.5)
     head = DeltaHead() if name == "JEPA" else DiagGaussianHead("constant")
     predictor = Predictor(latent_dim, head=head, skips=settings.skips)
     nn.init.normal_(linear.weight, std=observation_dim**-0.5)
@@ -266,7 +256,9 @@ def robust_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowL
         "collapse_rank": 0.0,
     }
     if name == "JEPA":
-        return JEPALoss(models, prediction_coeff=0.5, **common)
+        # The likelihood of a residual variance of 1/8. That of 1 tells a predictable direction from another
+        # so weakly that the noise of the batches stays in the encoder.
+        return JEPALoss(models, prediction_coeff=4.0, **common)
     common |= {"target_kl_coeff": 0.0, "residual_variance": "batch"}
     if name == "VJEPA":
         return VJEPALoss(models, **common)
@@ -274,6 +266,11 @@ def robust_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowL
 
 
 # Training: all runs of a model kind as one batch
+
+
+def select_objective(loss: WindowLoss) -> None:
+    """Training needs no diagnostics."""
+    loss.select_out_keys(*[key for key in loss.out_keys if key.startswith("loss_")])
 
 
 def objective(losses: TensorDict) -> Tensor:
@@ -318,11 +315,13 @@ def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[
     if settings.encoder == "linear" and name in ("AR", "JEPA"):
         windows = same_moments(observations)
     else:
-        windows = observations.unsqueeze(1)
+        # Each feature side by side in memory: the layout in which the losses of linear models compute.
+        windows = observations.mT.contiguous().mT.unsqueeze(1)
     batch = TensorDict(observation=windows, batch_size=windows.shape[:-1])
     loss = paper_loss(name, make_models(paper_model, name, runs, 1, settings), settings)
     updater = SoftUpdate(loss, eps=EMA_DECAY) if name in LATENT_MODELS else None
     optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr or 1e-3, fused=True)
+    select_objective(loss)
     torch.manual_seed(0)
     for _ in range(settings.steps or 6000):
         objective(loss(batch)).sum().backward()
@@ -335,45 +334,60 @@ def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[
 
 
 def train_robust(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[Any]:
-    """Minibatches, one cycle of a large learning rate, several starts; the objective chooses."""
+    """Two rounds: all starts of a run train a little, the best few train on; the objective chooses."""
     observations = torch.stack([run.normalise("robust")[0] for run in runs])
     models = make_models(robust_model, name, runs, settings.restarts, settings)
-    loss = robust_loss(name, models, settings)
+    rounds = [(settings.heat_steps, settings.finalists), (settings.steps or 100, 1)]
+    for steps, keep in rounds:
+        loss = robust_loss(name, models, settings)
+        starts = len(models) // len(runs)
+        best = fit_robust(loss, observations, steps, settings).topk(min(keep, starts)).indices
+        models = [loss.get_model(i * starts + int(k)) for i, row in enumerate(best) for k in row]
+    yield from models
+
+
+def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Settings) -> Tensor:
+    """One cycle of a large learning rate on minibatches; the score of each start, a row for each run."""
     updater = SoftUpdate(loss, eps=0.9)
-    linear = settings.encoder == "linear"
-    steps = settings.steps or (400 if linear else 500)
-    lr = settings.lr or (0.2 if linear else 0.1)
+    lr = settings.lr or 0.3
     mlp = [param for key, param in loss.named_parameters() if "mlp" in key]
     rest = [param for key, param in loss.named_parameters() if "mlp" not in key]
     groups = [{"params": rest, "lr": lr, "weight_decay": 0.0}]
     if mlp:
         groups.append({"params": mlp, "lr": 0.1 * lr, "weight_decay": 1.0})
-    optimizer = torch.optim.AdamW(groups, fused=True)
+    optimizer = torch.optim.AdamW(groups, betas=(0.8, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, [group["lr"] for group in groups], total_steps=steps, pct_start=0.2, cycle_momentum=False
     )
+    starts_of_a_run = loss.num_models // len(observations)
+    select_objective(loss)
 
     def batch(starts: Tensor) -> TensorDict:
         windows = observations[:, starts.unsqueeze(1) + torch.arange(settings.window)]
-        windows = windows.repeat_interleave(settings.restarts, dim=0)
+        windows = windows.repeat_interleave(starts_of_a_run, dim=0)
         return TensorDict(observation=windows, batch_size=windows.shape[:-1])
 
     torch.manual_seed(0)
     # The same windows for all: what a run sees does not depend on the others.
     generator = torch.Generator().manual_seed(0)
     last = observations.shape[1] - settings.window
+    slots = torch.arange(settings.windows)
     for _ in range(steps):
-        starts = torch.randint(last + 1, (settings.windows,), generator=generator)
+        # One window in each part of the trajectory: the variance of the signal grows with time.
+        offsets = slots + torch.rand(settings.windows, generator=generator)
+        starts = (offsets * (last / settings.windows)).long()
         objective(loss(batch(starts))).sum().backward()
         optimizer.step()
         optimizer.zero_grad()
         schedule.step()
         updater.step()
+    loss.reset_out_keys()
     with torch.no_grad():
         losses = loss(batch(torch.arange(0, last + 1, settings.window)))
-    score = -objective(losses) if name == "JEPA" else losses["mutual_information"]
-    for i, restart in enumerate(score.reshape(len(runs), settings.restarts).argmax(1)):
-        yield loss.get_model(i * settings.restarts + int(restart))
+    # The head's likelihood is that of a diagonal Gaussian, which depends on the basis of the latents.
+    score = losses.get("mutual_information", -objective(losses))
+    # topk takes NaN for the largest number.
+    return score.nan_to_num(-torch.inf).reshape(len(observations), starts_of_a_run)
 
 
 # Evaluation

@@ -172,13 +172,19 @@ def test_the_documentation_check_sees(source: str, expected: list[str]) -> None:
     assert missing_sections(Documented("m", node.name, node, True)) == expected
 
 
-# README -------------------------------------------------------------------------------------------
+# README and docs ----------------------------------------------------------------------------------
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
-def python_blocks() -> list[tuple[int, str]]:
-    """Line number and text of every Python block."""
-    blocks = re.finditer(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
-    return [(README.count("\n", 0, block.start()) + 1, block[1]) for block in blocks]
+def python_blocks() -> list[tuple[str, int, str]]:
+    """Page, line number and text of every Python block."""
+    found = []
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        for block in re.finditer(r"^```python\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL):
+            found.append((path.name, text.count("\n", 0, block.start()) + 1, block[1]))
+    return found
 
 
 def command(label: str) -> str:
@@ -191,15 +197,19 @@ def command(label: str) -> str:
 
 
 def test_readme_has_python_blocks() -> None:
-    assert python_blocks()
+    assert "README.md" in {page for page, _, _ in python_blocks()}
 
 
 @pytest.mark.parametrize(
-    ("line", "block"), python_blocks(), ids=[f"line{line}" for line, _ in python_blocks()]
+    ("page", "line", "block"),
+    python_blocks(),
+    ids=[f"{page}:{line}" for page, line, _ in python_blocks()],
 )
-def test_readme_block_runs(line: int, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_block_runs(
+    page: str, line: int, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile("\n" * line + block, "README.md", "exec"), {"__name__": "readme"})
+    exec(compile("\n" * line + block, page, "exec"), {"__name__": "documentation"})
 
 
 @pytest.mark.parametrize("label", ["main job", "tests"])
@@ -235,12 +245,16 @@ def test_ci_runs_the_readme_command() -> None:
     assert "-m pytest" not in script, "the test command belongs to README.md alone"
 
 
-def test_readme_links_and_images_exist() -> None:
-    targets = re.findall(r"\]\(([^)\s]+)\)", README) + re.findall(r'src="([^"]+)"', README)
-    relative = [target.split("#")[0] for target in targets if not re.match(r"https?:|#", target)]
-    assert any(target.endswith(".png") for target in relative), "the README shows a picture"
-    missing = [target for target in relative if not (ROOT / target).exists()]
+def test_links_and_images_exist() -> None:
+    missing, pictures = [], 0
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        targets = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+        relative = [target.split("#")[0] for target in targets if not re.match(r"https?:|#", target)]
+        missing += [f"{path.name}: {target}" for target in relative if not (path.parent / target).exists()]
+        pictures += path.name == "README.md" and any(target.endswith(".png") for target in relative)
     assert missing == []
+    assert pictures, "the README shows a picture"
 
 
 def test_readme_names_exist() -> None:

@@ -26,6 +26,7 @@ from torchrl_vjepa.whitening import Whitening
 FACTORIES: dict[str, Callable[..., TensorDictModuleBase]] = {
     "linear": linear_encoder,
     "mlp": lambda *args, **kw: mlp_encoder(*args, num_cells=(16,), **kw),
+    "residual mlp": lambda *args, **kw: mlp_encoder(*args, num_cells=(16,), residual=True, **kw),
     "history": lambda *args, **kw: history_encoder(*args, hidden_dim=6, **kw),
 }
 every_encoder = pytest.mark.parametrize("make", FACTORIES.values(), ids=FACTORIES)
@@ -303,6 +304,21 @@ def test_mlp_encoder_is_its_layers() -> None:
     hidden = torch.tanh(torch.tanh(x @ weights[0].mT + weights[1]) @ weights[2].mT + weights[3])
     torch.testing.assert_close(encoder(observation=x), hidden @ weights[4].mT + weights[5])
     assert len(list(mlp_encoder(5, 2, num_cells=()).parameters())) == 2
+
+
+@pytest.mark.parametrize("whitened", [False, True])
+def test_residual_mlp_encoder_adds_a_linear_map(whitened: bool) -> None:
+    whitening = _whitening(5) if whitened else None
+    encoder = mlp_encoder(5, 2, num_cells=(8,), residual=True, whitening=whitening)
+    network = encoder.module.network
+    assert [tuple(w.shape) for w in network.linear.parameters()] == [(2, 5)]
+    assert [tuple(w.shape) for w in network.mlp.parameters()] == [(8, 5), (8,), (2, 8), (2,)]
+    x = torch.randn(7, 5)
+    y = x if whitening is None else whitening(x)
+    torch.testing.assert_close(
+        encoder(observation=x), y @ network.linear.weight.mT + network.mlp(y), atol=1e-5, rtol=1e-5
+    )
+    assert {"linear", "mlp"} == {name for name, _ in network.named_children()}
 
 
 @every_encoder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 import json
 import math
@@ -16,6 +17,7 @@ import pytest
 import torch
 from sklearn.metrics import r2_score
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -330,7 +332,8 @@ def test_the_table_check_sees(change: dict[str, Any]) -> None:
 def table_settings(module: Any, **changes: Any) -> Any:
     """A robust run of seconds, from data of a few hundred steps."""
     small = {"seeds": [0], "noise_scales": [8.0], "train_length": 400, "test_length": 100}
-    return module.Settings(**{**small, "restarts": 2, "steps": 12, "sizes": [2, 2, 6], **changes})
+    race = {"restarts": 3, "finalists": 2, "heat_steps": 6, "steps": 12}
+    return module.Settings(**{**small, **race, "sizes": [2, 2, 6], **changes})
 
 
 @pytest.fixture(scope="module")
@@ -356,6 +359,56 @@ def test_a_run_does_not_depend_on_the_others(table: Any, preset: str, name: str,
     assert [row["noise_scale"] for row in together] == [0.0, 2.0, 8.0]
     for key in ("signal_r2_train", "signal_r2", "noise_r2_train", "noise_r2"):
         assert together[-1][key] == pytest.approx(alone[0][key], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("restarts", "finalists", "rounds"), [(4, 2, [(8, 6), (4, 12)]), (1, 2, [(2, 6), (2, 12)])]
+)
+def test_the_race_keeps_the_best_starts_of_each_run(
+    table: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    restarts: int,
+    finalists: int,
+    rounds: list[tuple[int, int]],
+) -> None:
+    settings = table_settings(table, restarts=restarts, finalists=finalists, noise_scales=[0.0, 8.0])
+    runs = table.Run.simulate(0, settings)
+    starts = table.make_models(table.robust_model, "VJEPA", runs, restarts, settings)
+    weights = torch.stack([model.encoder.module.network.weight.detach() for model in starts])
+    # Of the first run start 1 wins the heat and start 3 the race; of the second 2 and 0.
+    scores = [
+        torch.tensor([[0.0, 3.0, 1.0, 2.0], [1.0, 0.0, 2.0, -1.0]])[:, :restarts],
+        torch.tensor([[1.0, 2.0], [0.0, 5.0]])[:, : min(restarts, finalists)],
+    ]
+    seen = []
+
+    def fit(loss: Any, observations: Tensor, steps: int, settings: Any) -> Tensor:
+        seen.append((loss.num_models, steps))
+        return scores[len(seen) - 1]
+
+    monkeypatch.setattr(table, "fit_robust", fit)
+    chosen = [model.encoder.module.network.weight for model in table.train_robust("VJEPA", runs, settings)]
+    assert seen == rounds
+    expected = weights[[3, restarts]] if restarts > 1 else weights
+    torch.testing.assert_close(torch.stack(chosen).detach(), expected)
+
+
+@pytest.mark.parametrize("encoder", ["linear", "mlp"])
+def test_every_start_of_a_race_trains(table: Any, encoder: str) -> None:
+    settings = table_settings(table, encoder=encoder)
+    (run,) = table.Run.simulate(0, settings)
+    before = table.make_models(table.robust_model, "VJEPA", [run], 2, settings)
+    models = table.make_models(table.robust_model, "VJEPA", [run], 2, settings)
+    observations = run.normalise("robust")[0].unsqueeze(0)
+    for _ in range(2):
+        loss = table.robust_loss("VJEPA", models, settings)
+        scores = table.fit_robust(loss, observations, 4, settings)
+        assert scores.shape == (1, 2)
+        models = [loss.get_model(i) for i in range(2)]
+        for model, old in zip(models, before, strict=True):
+            for value, other in zip(model.encoder.parameters(), old.encoder.parameters(), strict=True):
+                assert (value != other).any()
+        before = copy.deepcopy(models)
 
 
 @pytest.mark.parametrize("name", ["AR", "JEPA"])

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from torchrl_vjepa.distributions import Delta, sample
-from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale, soft_clamp
+from torchrl_vjepa.distributions import Delta, sample, soft_clamp
+from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale
 from torchrl_vjepa.predictor import Predictor
 
 # One line per head, and every test of TestEveryHead runs for it.

@@ -22,6 +22,7 @@ PACKAGE = ROOT / "torchrl_vjepa"
 LAYERS = {
     "distributions": 0,
     "generators": 0,
+    "stacking": 0,
     "noisy_tv": 0,
     "statistics": 0,
     "windows": 0,
@@ -44,6 +45,8 @@ LAYERS = {
 }
 # Who may import whom within one layer.
 SIDEWAYS = {
+    ("distributions", "stacking"),
+    ("statistics", "stacking"),
     ("encoders", "whitening"),
     ("baselines", "models"),
     ("baselines", "objectives"),

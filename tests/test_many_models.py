@@ -71,10 +71,14 @@ def pixel_ar(i: int) -> nn.Module:
 
 
 CASES: dict[str, tuple[Callable[..., Any], Callable[[int], nn.Module], dict[str, Any]]] = {
-    "JEPA": (JEPALoss, jepa, REGULARISERS),
+    "JEPA": (JEPALoss, jepa, {**REGULARISERS, "sliced_entropy_coeff": 0.4}),
     "VJEPA": (VJEPALoss, vjepa, {**REGULARISERS, "skip_weights": (1.0, 2.0), "sliced_entropy_coeff": 0.3}),
     "VJEPA batch": (VJEPALoss, vjepa, {**REGULARISERS, "residual_variance": "batch"}),
-    "BJEPA": (BJEPALoss, bjepa, {**REGULARISERS, "structural_kl_coeff": 0.4}),
+    "BJEPA": (
+        BJEPALoss,
+        bjepa,
+        {**REGULARISERS, "structural_kl_coeff": 0.4, "sliced_entropy_coeff": 0.2, "target_kl_coeff": 0.5},
+    ),
     "BJEPA fixed full prior": (BJEPALoss, bjepa_fixed, REGULARISERS),
     "VAE": (VAELoss, vae, {"kl_coeff": 0.5}),
     "PixelAR": (PixelARLoss, pixel_ar, {}),
@@ -212,3 +216,20 @@ def test_models_that_share_a_module_are_refused() -> None:
     SoftUpdate(loss, eps=0.9)
     windows = TensorDict(observation=torch.randn(4, 5, OBS), batch_size=(4, 5))
     assert loss(windows)["loss_structural_kl"].shape == (2,)
+
+
+@EVERY
+def test_the_best_models_train_on_in_a_new_loss(case: str) -> None:
+    models = make_models(case)
+    trainable = [[p.requires_grad for p in model.parameters()] for model in models]
+    first, _ = train(case, models, make_batches(stacked=False))
+    survivors = [first.get_model(i) for i in (0, 2)]
+    assert [[p.requires_grad for p in model.parameters()] for model in survivors] == [
+        trainable[0],
+        trainable[2],
+    ]
+    before = [copy.deepcopy(model.encoder.state_dict()) for model in survivors]
+    second, _ = train(case, survivors, make_batches(stacked=False))
+    for i, old in enumerate(before):
+        new = second.get_model(i).encoder.state_dict()
+        assert all((new[key] != value).all() for key, value in old.items())

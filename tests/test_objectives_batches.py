@@ -337,7 +337,7 @@ BAD_WINDOWS = {
     "observation size": (
         lambda: spoilt(observation=torch.randn(4, 6, OBS + 1).double()),
         ValueError,
-        r"'observation' must have shape .*6\), got \(4, 6, 7\)",
+        r"'observation' must have shape .*6\), got \(24, 7\)",
     ),
     "action size": (lambda: spoilt(action=torch.randn(4, 6, 3).double()), ValueError, "action must have"),
     "other dtype": (lambda: make_windows(4, 6).float(), TypeError, "dtype of the encoder's weights"),

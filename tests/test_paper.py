@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torch.distributions import MultivariateNormal
+from torch.distributions import MultivariateNormal, Normal, kl_divergence
 from torchrl.objectives import SoftUpdate
 
 from torchrl_vjepa import (
@@ -74,7 +74,9 @@ def set_weights(model: VJEPA, encoder: Tensor, trunk: Tensor, log_var: Tensor) -
 
 @pytest.mark.parametrize("log_var", [-2.0, 0.0, 1.5])
 def test_deterministic_jepa_is_a_special_case_of_vjepa(log_var: float) -> None:
-    """Delta target and fixed variance: gradients are those of the squared loss over 2 sigma^2."""
+    """eq:vjepa_objective to eq:JEPA_squared_loss: with a delta target and a fixed variance the gradients are
+    those of the squared loss over 2 sigma^2.
+    """
     model = make_model(6, 3, action_dim=2, skips=(1, 2))
     with torch.no_grad():
         model.predictor.constants.fill_(log_var)
@@ -108,8 +110,25 @@ def test_squared_loss_equals_gaussian_likelihood(log_var: float) -> None:
     torch.testing.assert_close(nll, error / (2 * variance) + constant, rtol=1e-6, atol=1e-6)
 
 
+def test_eq_vjepa_objective_regularises_the_target_towards_the_reference() -> None:
+    """The second term: beta E KL(q(Z | x) || N(0, I)), zero for a target that is the reference itself."""
+    model, beta = make_model(6, 3, std=0.5), 0.3
+    loss = associated(VJEPALoss(model, target_kl_coeff=beta, collapse_rank=0.0))
+    windows = TensorDict(observation=torch.randn(8, 5, 6, dtype=torch.float64), batch_size=(8, 5))
+    latent = windows["observation"] @ model.encoder.module.network.weight.detach().mT
+    reference = Normal(torch.zeros(3).double(), torch.ones(3).double())
+    kl = kl_divergence(Normal(latent, 0.5), reference).sum(-1).mean()
+    terms = loss(windows)
+    assert terms["loss_target_kl"].item() == pytest.approx(beta * kl.item(), rel=1e-5)
+    assert terms["target_kl"].item() == pytest.approx(kl.item(), rel=1e-5)
+    model = make_model(6, 3, std=1.0)
+    model.encoder.module.network.weight.data.zero_()
+    loss = associated(VJEPALoss(model, target_kl_coeff=beta, collapse_rank=0.0))
+    assert loss(windows)["loss_target_kl"].item() == pytest.approx(0.0, abs=1e-6)
+
+
 def test_ema_rule() -> None:
-    """theta' <- tau theta' + (1 - tau) theta, over several steps of a moving encoder."""
+    """eq:target_encoder_weights_EMA: theta' <- tau theta' + (1 - tau) theta, several times."""
     tau = 0.9
     model = make_model(6, 3)
     loss = JEPALoss(model)
@@ -154,7 +173,10 @@ def test_mean_targets_collapse_the_predictors_variance() -> None:
 
 
 def test_collapsed_encoder_is_not_a_global_optimum_under_target_diversity() -> None:
-    """Best collapsed solution: the aggregate entropy; what a predictor gains is the information."""
+    """thm:collapse_avoidance.
+
+    Best collapsed solution: the aggregate entropy; what a predictor gains is the information.
+    """
     a = torch.tensor([0.9, 0.6], dtype=torch.float64)
     context, target = linear_gaussian(500, a)
     model = make_model(2, 2)
@@ -189,6 +211,7 @@ def test_collapsed_encoder_is_not_a_global_optimum_under_target_diversity() -> N
 
 @pytest.mark.parametrize("residual_variance", ["head", "batch"])
 def test_mutual_information_bound_holds_and_is_tight_at_the_true_model(residual_variance: str) -> None:
+    """thm:mi_bound: the closed form -log(1 - a^2) / 2 per dimension at the true model, less elsewhere."""
     a = torch.tensor([0.95, 0.5, 0.0], dtype=torch.float64)
     windows = pairs(*linear_gaussian(600, a))
     truth = -0.5 * (1 - a**2).log().sum().item()
@@ -213,7 +236,7 @@ def test_mutual_information_bound_holds_and_is_tight_at_the_true_model(residual_
 
 
 def test_nuisance_invariance() -> None:
-    """x = (signal, unpredictable noise): trained VJEPA gives the noise no weight."""
+    """prop:nuisance_invariance: x = (signal, unpredictable noise): VJEPA gives the noise no weight."""
     num, a = 400, 0.9
     noise_and_signal = exact_normal(num, 6)
     signal, drive = noise_and_signal[:, :1], noise_and_signal[:, 1:2]
@@ -243,7 +266,7 @@ def test_nuisance_invariance() -> None:
 
 
 def test_nuisance_costs_nothing_to_discard() -> None:
-    """The minimal representation reaches the optimal loss of the maximal one."""
+    """prop:nuisance_invariance: the minimal representation reaches the optimal loss of the maximal one."""
     samples = exact_normal(800, 4)
     signal, noise, drive = samples[:, :1], samples[:, 1:2], samples[:, 2:3]
     following = torch.cat([0.8 * signal + 0.6 * drive, samples[:, 3:]], 1)

@@ -62,7 +62,7 @@ def minimise(loss: VAELoss | VJEPALoss, windows: TensorDict, steps: int, rate: f
 
 
 def test_vjepa_is_bjepa_with_an_uninformative_prior() -> None:
-    """p_prior proportional to 1: the posterior predictor is the likelihood itself, exactly."""
+    """eq:bjepa_posterior with p_prior proportional to 1: the posterior is the likelihood itself."""
     model = make_model(6, 3)
     latent = torch.randn(5, 3, dtype=torch.float64)
     likelihood = model.predictor.dist(latent)
@@ -86,7 +86,7 @@ def test_a_vague_prior_tends_to_the_uninformative_one() -> None:
 
 
 def test_bjepa_without_the_structural_term_trains_like_vjepa() -> None:
-    """gamma = 0: the same weights after several steps of Adam and EMA."""
+    """eq:bjepa_training_objective with gamma = 0: the same weights after several steps of Adam and EMA."""
     model = make_model(6, 3)
     plain = VJEPA(
         linear_encoder(6, 3), Predictor(3, head=model.predictor.head), target_scale=model.target_scale.module
@@ -145,7 +145,7 @@ def test_the_structural_term_pulls_the_dynamics_to_the_prior() -> None:
 
 
 def test_hard_fusion_filters_like_kalman() -> None:
-    """Predict with p_phi, update with a measurement as the prior expert; several steps of the filter."""
+    """eq:bjepa_filter. Predict with p_phi, update with a measurement as the prior expert; several steps."""
     model = make_model(5, 2, action_dim=1)
     a = torch.tensor([[0.9, 0.3], [-0.3, 0.8]], dtype=torch.float64)
     b = torch.tensor([[0.5], [1.0]], dtype=torch.float64)
@@ -213,7 +213,7 @@ def test_joint_embedding_discards_the_noise() -> None:
 
 @pytest.mark.parametrize("start", ["signal", "random"])
 def test_reconstruction_keeps_the_noise(start: str) -> None:
-    """The optimal linear VAE of the same system: all weight on the noise that varies most.
+    """prop:nuisance_invariance. The optimal linear VAE: all weight on the noise that varies most.
 
     Also from the encoder that a joint-embedding model would find: it is a saddle, not a minimum.
     """

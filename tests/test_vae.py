@@ -102,7 +102,7 @@ def test_loss_equals_the_formula(reduction: str) -> None:
     torch.manual_seed(4)
     terms = VAELoss(model, kl_coeff=0.3, reduction=reduction)(windows)
     torch.manual_seed(4)
-    noise = torch.randn(6, 5, LATENT, dtype=torch.float64)
+    noise = torch.randn(LATENT, 6, 5, dtype=torch.float64).movedim(0, -1)
     error, kl = elbo_terms(model, windows["observation"], noise)
     reduce = {"mean": Tensor.mean, "sum": Tensor.sum, "none": lambda x: x}[reduction]
     assert list(terms.keys()) == ["loss_reconstruction", "loss_kl"]
@@ -131,7 +131,7 @@ def test_padding_counts_nowhere_and_ends_of_episodes_do(garbage: float) -> None:
     windows = make_windows(6, 5)
     mask = torch.rand(6, 5) < 0.7
     torch.manual_seed(4)
-    noise = torch.randn(6, 5, LATENT, dtype=torch.float64)
+    noise = torch.randn(LATENT, 6, 5, dtype=torch.float64).movedim(0, -1)
     error, kl = elbo_terms(model, windows["observation"], noise)
     windows["observation"][~mask] = garbage
     windows["collector", "mask"] = mask.unsqueeze(-1)

@@ -28,13 +28,16 @@ from torchrl_vjepa.noisy_tv import (
     NoisyTVEnv,
 )
 from torchrl_vjepa.objectives import (
+    AdaptiveCoefficient,
     BJEPALoss,
     CollapseWarning,
     JEPALoss,
     LatentPredictionLoss,
     RewardLoss,
+    Selection,
     VJEPALoss,
     WindowLoss,
+    select_best,
 )
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
@@ -44,6 +47,7 @@ from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_ga
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
+    "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
     "BatchedNoisyTVEnv",
@@ -82,6 +86,7 @@ __all__ = [
     "QuadraticReward",
     "RandomShooting",
     "RewardLoss",
+    "Selection",
     "TargetScale",
     "VAE",
     "VAELoss",
@@ -110,6 +115,7 @@ __all__ = [
     "quadratic_cost",
     "rollout",
     "sample",
+    "select_best",
     "sliced_gaussian_distance",
     "surprise",
     "systematic_resampling",

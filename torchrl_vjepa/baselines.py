@@ -14,6 +14,7 @@ from torchrl.modules import MLP
 from torchrl_vjepa.distributions import Delta
 from torchrl_vjepa.models import LatentModel
 from torchrl_vjepa.objectives import WindowLoss
+from torchrl_vjepa.stacking import StackableLinear, columns, halves, shared_noise, squared_distance
 from torchrl_vjepa.windows import read
 
 __all__ = ["VAE", "PixelAR", "PixelARLoss", "PixelDecoder", "VAELoss"]
@@ -297,21 +298,27 @@ class VAELoss(WindowLoss):
     def _loss_keys(self) -> Iterator[str]:
         yield from ("loss_reconstruction", "loss_kl")
 
-    def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
         encoder_params, decoder_params = params
-        observation = data.get(self.encoder.in_keys[0])
-        mask, length = masks.get("steps"), observation.shape[1]
+        observation = self._flat(data.get(self.encoder.in_keys[0]))
         with encoder_params.to_module(self.encoder):
             posterior = self.encoder.module(observation)
         if posterior.dtype in (torch.float16, torch.bfloat16):
             posterior = posterior.float()
-        mean, log_var = posterior.chunk(2, dim=-1)
-        latent = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
+        mean, log_var = halves(posterior)
+        latent = torch.addcmul(mean, (0.5 * log_var).exp(), shared_noise(mean, 2))
         with decoder_params.to_module(self.decoder):
-            error = (observation - self.decoder.module(latent)).pow(2).sum(-1)
-        kl = 0.5 * (log_var.exp() + mean.pow(2) - 1 - log_var).sum(-1)
+            decoded = self.decoder.module(latent)
+        return {
+            "error": squared_distance(decoded, observation),
+            "kl": 0.5 * (columns(mean).square() + columns(log_var).exp() - columns(log_var) - 1).sum(-2),
+        }
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        length, mask = data.shape[-1], masks.get("steps")
+        error, kl = (outputs[name].unflatten(-1, (-1, length)) for name in ("error", "kl"))
         return {
             "loss_reconstruction": self._reduce([error], [mask], length),
             "loss_kl": self.kl_coeff * self._reduce([kl], [mask], length),
@@ -374,18 +381,24 @@ class PixelARLoss(WindowLoss):
     def _loss_keys(self) -> Iterator[str]:
         yield "loss_reconstruction"
 
-    def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
         encoder_params, decoder_params = params
         observation = data.get(self.encoder.in_keys[0])
         latent_key, *action_keys = self.decoder.in_keys
-        latent = self._encode(data[:, :-1], encoder_params, latent_key)
-        actions = [data.get(key)[:, :-1] for key in action_keys]
+        latent = self._flat(self._encode(data, encoder_params, latent_key), slice(-1))
+        actions = [self._flat(data.get(key), slice(-1)) for key in action_keys]
+        actions = [action.expand(*latent.shape[:-1], -1) for action in actions]
         with decoder_params.to_module(self.decoder):
             predicted = self.decoder.module(latent, *actions)
-        error = (predicted - observation[:, 1:]).pow(2).sum(-1)
-        return {"loss_reconstruction": self._reduce([error], [masks.get("1")], observation.shape[1])}
+        target = self._flat(observation, slice(1, None))
+        return {"error": squared_distance(predicted, target)}
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        length = data.shape[-1]
+        error = outputs["error"].unflatten(-1, (-1, length - 1))
+        return {"loss_reconstruction": self._reduce([error], [masks.get("1")], length)}
 
 
 class _Decode(nn.Module):
@@ -395,6 +408,10 @@ class _Decode(nn.Module):
         super().__init__()
         self.trunk = trunk
         self.latent_dim, self.action_dim = latent_dim, action_dim
+
+    @property
+    def stackable(self) -> bool:
+        return getattr(self.trunk, "stackable", False)
 
     def forward(self, latent: Tensor, action: Tensor | None = None) -> Tensor:
         return self.trunk(_joined(latent, action, self.latent_dim, self.action_dim))
@@ -416,7 +433,7 @@ def _trunk(
     trunk: Literal["linear", "mlp"], in_features: int, out_features: int, num_cells: Sequence[int]
 ) -> nn.Module:
     if trunk == "linear":
-        return nn.Linear(in_features, out_features, bias=False)
+        return StackableLinear(in_features, out_features, bias=False)
     if trunk == "mlp":
         return MLP(in_features, out_features, num_cells=list(num_cells))
     raise ValueError(f"trunk must be 'linear' or 'mlp', got {trunk!r}")

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.distributions import (
     Distribution,
@@ -18,10 +19,13 @@ from torch.distributions import (
     MultivariateNormal,
     Normal,
     constraints,
+    register_kl,
 )
 from torchrl.modules import Delta as _TorchRLDelta
 
-__all__ = ["Delta", "diag_gaussian", "point_estimate", "product_of_experts", "sample"]
+from torchrl_vjepa.stacking import columns
+
+__all__ = ["Delta", "diag_gaussian", "point_estimate", "product_of_experts", "sample", "soft_clamp"]
 
 
 class Delta(_TorchRLDelta):
@@ -81,7 +85,42 @@ class Delta(_TorchRLDelta):
         return type(self)(self.param.expand(*batch_shape, *self.event_shape))
 
 
-def diag_gaussian(loc: Tensor, scale: Tensor) -> Independent:
+def soft_clamp(value: Tensor, low: float, high: float) -> Tensor:
+    r"""Clamp with a gradient everywhere.
+
+    The identity up to a margin :math:`m` from the bounds (1, or a quarter of a narrow range); beyond it,
+    the excess :math:`e` becomes :math:`m e / (m + |e|)`, which approaches the bound. (Softplus would do
+    the same at several times the cost.)
+
+    Args:
+        value: any tensor.
+        low: lower bound, approached and never passed.
+        high: upper bound, approached and never passed.
+
+    Returns:
+        A tensor of the same shape with values in ``[low, high]``.
+
+    Examples:
+        >>> import torch
+        >>> soft_clamp(torch.tensor([-1000.0, 1.5, 1000.0]), -10.0, 10.0).round(decimals=2)
+        tensor([-10.0000,   1.5000,  10.0000])
+    """
+    margin = min(1.0, (high - low) / 4)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low) - margin
+    # Each line is one fused pass; what lies beyond the margin is zero almost everywhere.
+    inside = F.hardtanh(value, low + margin, high - margin)
+    excess = F.softshrink(value - middle if middle else value, half)
+    excess = F.hardtanh(excess, -1e6, 1e6)  # infinity over infinity
+    return inside + excess / (1 + excess.abs() / margin)
+
+
+def diag_gaussian(
+    loc: Tensor,
+    scale: Tensor | None = None,
+    *,
+    log_var: Tensor | None = None,
+    log_var_range: tuple[float, float] | None = None,
+) -> Independent:
     r"""Diagonal Gaussian :math:`\mathcal N(\mu, \mathrm{diag}(\sigma^2))` over the last dimension.
 
     Arguments are not validated: the check reads values, which stalls a GPU and breaks ``vmap``.
@@ -89,35 +128,140 @@ def diag_gaussian(loc: Tensor, scale: Tensor) -> Independent:
     Args:
         loc: mean, of shape ``(*B, D)``.
         scale: standard deviation, positive, broadcastable to ``(*B, D)``.
+        log_var: :math:`\log \sigma^2` instead of ``scale``; what a network gives, and the likelihood then
+            needs neither a root nor a logarithm.
+        log_var_range: ``log_var`` is softly clamped to it (:func:`soft_clamp`), once it is needed.
 
     Returns:
         A distribution with batch ``*B`` and event ``(D,)``.
+
+    Raises:
+        ValueError: if not exactly one of ``scale`` and ``log_var`` is given.
 
     Examples:
         >>> import torch
         >>> diag_gaussian(torch.zeros(5, 3), torch.ones(3)).event_shape
         torch.Size([3])
+        >>> diag_gaussian(torch.zeros(5, 3), log_var=torch.zeros(3)).variance[0]
+        tensor([1., 1., 1.])
     """
+    spread = log_var if scale is None else scale
+    if spread is None or (scale is not None and log_var is not None):
+        raise ValueError(
+            f"exactly one of scale and log_var must be given, got {'neither' if spread is None else 'both'}"
+        )
     # Under autocast a learned scale keeps its dtype, and torch.normal refuses two.
-    dtype = torch.promote_types(loc.dtype, scale.dtype)
-    return _DiagGaussian(loc.to(dtype), scale.to(dtype))
+    if loc.dtype != spread.dtype:
+        dtype = torch.promote_types(loc.dtype, spread.dtype)
+        loc, spread = loc.to(dtype), spread.to(dtype)
+    return _DiagGaussian(loc, spread, scale is None, log_var_range)
 
 
 class _DiagGaussian(Independent):
-    """``Independent(Normal)`` that keeps a scale shared by the batch small: one logarithm, not B."""
+    """``Independent(Normal)`` that computes what is asked for and keeps a shared spread small."""
 
-    def __init__(self, loc: Tensor, scale: Tensor) -> None:
-        self._scale = scale.expand(*scale.shape[:-1], loc.shape[-1])
-        loc, scale = torch.broadcast_tensors(loc, scale)
-        super().__init__(Normal(loc, scale, validate_args=False), 1, validate_args=False)
+    def __init__(
+        self,
+        loc: Tensor,
+        spread: Tensor,
+        is_log_var: bool,
+        log_var_range: tuple[float, float] | None = None,
+    ) -> None:
+        # Not Independent's constructor: a training step needs no base distribution.
+        size = loc.shape[-1]
+        batch = loc.shape[:-1]
+        if spread.ndim > 1 and spread.shape[:-1] != batch:
+            batch = torch.broadcast_shapes(batch, spread.shape[:-1])
+            loc = loc.expand(*batch, size)
+        if spread.shape[-1:] != (size,):
+            spread = spread.expand(*spread.shape[:-1], size)
+        self.loc = loc
+        self._given = spread
+        self._is_log_var, self._log_var_range = is_log_var, log_var_range
+        self.reinterpreted_batch_ndims = 1
+        Distribution.__init__(self, batch, loc.shape[-1:], validate_args=False)
+
+    @property
+    def _spread(self) -> Tensor:
+        """Scale or bounded log-variance: a loss that needs the mean alone does not pay for it."""
+        if self._log_var_range is not None:
+            self._given, self._log_var_range = soft_clamp(self._given, *self._log_var_range), None
+        return self._given
+
+    @property
+    def base_dist(self) -> Normal:
+        loc, scale = torch.broadcast_tensors(self.loc, self.scale)
+        return Normal(loc, scale, validate_args=False)
+
+    @property
+    def scale(self) -> Tensor:
+        """Standard deviation, broadcastable to the mean."""
+        return (0.5 * self._spread).exp() if self._is_log_var else self._spread
+
+    @property
+    def log_var(self) -> Tensor:
+        """Logarithm of the variance, broadcastable to the mean."""
+        return self._spread if self._is_log_var else 2 * self._spread.log()
+
+    @property
+    def precision(self) -> Tensor:
+        """Inverse variance, broadcastable to the mean."""
+        return (-self._spread).exp() if self._is_log_var else self._spread.pow(-2)
+
+    @property
+    def mean(self) -> Tensor:
+        return self.loc
+
+    @property
+    def mode(self) -> Tensor:
+        return self.loc
+
+    @property
+    def variance(self) -> Tensor:
+        variance = self._spread.exp() if self._is_log_var else self._spread.square()
+        return variance.expand_as(self.loc)
+
+    @property
+    def stddev(self) -> Tensor:
+        return self.scale.expand_as(self.loc)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        normed = (value - self.base_dist.loc) / self._scale
-        constant = self._scale.log().sum(-1) + 0.5 * value.shape[-1] * math.log(2 * math.pi)
-        return -0.5 * normed.square().sum(-1) - constant
+        constant = 0.5 * value.shape[-1] * math.log(2 * math.pi)
+        shared = self._given.ndim == 1 or (self._given.shape[-2] == 1 and self.loc.ndim > 1)
+        # Columns: gradients keep the layout of the latents of a loss (``features_first``).
+        squares = columns(value - self.loc).square()
+        log_var, precision = columns(self.log_var), columns(self.precision)
+        if shared:
+            # One constant for all rows.
+            quadratic = (squares * precision).sum(-2)
+            log_prob = torch.sub(-(constant + 0.5 * log_var.sum(-2)), quadratic, alpha=0.5)
+        else:
+            log_prob = torch.addcmul(log_var, squares, precision).sum(-2).mul(-0.5).sub(constant)
+        return log_prob if value.ndim > 1 or self.loc.ndim > 1 else log_prob.squeeze(-1)
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        shape = (*sample_shape, *self.loc.shape)
+        noise = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
+        return torch.addcmul(self.loc, self.scale, noise)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        with torch.no_grad():
+            return self.rsample(sample_shape)
+
+    def entropy(self) -> Tensor:
+        constant = 0.5 * self.loc.shape[-1] * (1 + math.log(2 * math.pi))
+        return (constant + 0.5 * self.log_var.sum(-1)).expand(self.batch_shape)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> _DiagGaussian:
-        return _DiagGaussian(self.base_dist.loc.expand(*batch_shape, *self.event_shape), self._scale)
+        loc = self.loc.expand(*batch_shape, *self.event_shape)
+        return _DiagGaussian(loc, self._given, self._is_log_var, self._log_var_range)
+
+
+@register_kl(_DiagGaussian, _DiagGaussian)
+def _kl_diagonal(p: _DiagGaussian, q: _DiagGaussian) -> Tensor:
+    log_ratio = p.log_var - q.log_var
+    mahalanobis = (p.loc - q.loc).square() * q.precision
+    return 0.5 * (log_ratio.exp() - 1 - log_ratio + mahalanobis).sum(-1)
 
 
 def sample(

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torchrl.modules import MLP, GRUModule
 
+from torchrl_vjepa.stacking import linear
 from torchrl_vjepa.whitening import Whitening, check_observation, check_size
 
 __all__ = ["history_encoder", "linear_encoder", "mlp_encoder"]
 
 
 class _ObservationNetwork(nn.Module):
-    """Check the observation, whiten it, encode it."""
+    """Check the observation, whiten it, encode it: each row for itself."""
+
+    row_wise = True
 
     def __init__(
         self,
@@ -36,14 +39,36 @@ class _ObservationNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         dtype = next(self.network.parameters()).dtype
         check_observation(observation, self.observation_dim, self.key, dtype)
-        if self.whitening is None:
-            return self.network(observation)
         if isinstance(self.network, nn.Linear):
-            # One product instead of two; for several models at once the larger one is not repeated.
-            weight = self.network.weight @ self.whitening.transform.mT
-            centered = observation - self.whitening.mean.to(observation.dtype)
-            return F.linear(centered, weight, self.network.bias)
-        return self.network(self.whitening(observation))
+            return self._linear(observation)
+        return self.network(observation if self.whitening is None else self.whitening(observation))
+
+    @property
+    def stackable(self) -> bool:
+        """Whether weights of several models, stacked, can be used as they are: see ``linear``."""
+        return isinstance(self.network, nn.Linear)
+
+    def _linear(self, observation: Tensor) -> Tensor:
+        weight: Any = self.network.weight
+        bias: Any = self.network.bias
+        if self.whitening is None:
+            return linear(observation, weight, bias)
+        # One product instead of two; for several models at once the larger one is not repeated.
+        weight = weight @ self.whitening.transform.mT
+        mean = self.whitening.mean.to(observation.dtype)
+        return linear(observation - (mean if mean.ndim == 1 else mean.unsqueeze(-2)), weight, bias)
+
+
+class _ResidualMLP(nn.Module):
+    """A linear map and an MLP that bends it."""
+
+    def __init__(self, linear: nn.Linear, mlp: MLP) -> None:
+        super().__init__()
+        self.linear = linear
+        self.mlp = mlp
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.linear(observation) + self.mlp(observation)
 
 
 def linear_encoder(
@@ -96,17 +121,24 @@ def mlp_encoder(
     *,
     num_cells: Sequence[int] = (256, 256),
     activation_class: type[nn.Module] = nn.SiLU,
+    residual: bool = False,
     whitening: Whitening | None = None,
     in_key: NestedKey = "observation",
     out_key: NestedKey = "latent",
 ) -> TensorDictModule:
     r"""Multi-layer perceptron encoder, :math:`Z_t = f_\theta(x_t)` (``eq:context_encoder``).
 
+    With ``residual=True`` it is :math:`f_\theta(x) = W x + \mathrm{MLP}_\theta(x)`: the linear map finds
+    directions, the MLP bends them. Its parts are ``encoder.module.network.linear`` and ``.mlp``, so that
+    they can start and decay differently.
+
     Args:
         observation_dim: Features of the observation :math:`O`, at least 1.
         latent_dim: Size of the latent :math:`D`, at least 1.
         num_cells: Width of each hidden layer, each at least 1; empty for an affine map.
         activation_class: Activation after each hidden layer; the output has none.
+        residual: Whether a linear map of the (whitened) observation, without bias, is added to the
+            output.
         whitening: Applied to the observation first. Not trained; see :class:`Whitening`.
         in_key: Key of the observation, shape ``(*B, O)``.
         out_key: Key that the latent is written to, shape ``(*B, D)``.
@@ -123,17 +155,21 @@ def mlp_encoder(
         >>> encoder = mlp_encoder(20, 4, num_cells=(32,), in_key="state", out_key=("a", "latent"))
         >>> encoder(state=torch.zeros(8, 20)).shape
         torch.Size([8, 4])
+        >>> sorted(dict(mlp_encoder(20, 4, residual=True).module.network.named_children()))
+        ['linear', 'mlp']
     """
     check_size("observation_dim", observation_dim)
     check_size("latent_dim", latent_dim)
     for width in num_cells:
         check_size("num_cells", width)
-    network = MLP(
+    network: nn.Module = MLP(
         in_features=observation_dim,
         out_features=latent_dim,
         num_cells=list(num_cells),
         activation_class=activation_class,
     )
+    if residual:
+        network = _ResidualMLP(nn.Linear(observation_dim, latent_dim, bias=False), network)
     return TensorDictModule(
         _ObservationNetwork(network, observation_dim, whitening, in_key),
         in_keys=[in_key],

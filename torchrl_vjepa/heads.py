@@ -14,36 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Independent
 
-from torchrl_vjepa.distributions import Delta, diag_gaussian
+from torchrl_vjepa.distributions import Delta, diag_gaussian, soft_clamp
+from torchrl_vjepa.stacking import halves, linear
 
 __all__ = ["DeltaHead", "DiagGaussianHead", "Head", "TargetScale", "soft_clamp"]
-
-
-def soft_clamp(value: Tensor, low: float, high: float) -> Tensor:
-    r"""Clamp with a gradient everywhere.
-
-    The identity up to a margin :math:`m` from the bounds (1, or a quarter of a narrow range); beyond it,
-    the excess :math:`e` becomes :math:`m e / (m + |e|)`, which approaches the bound. (Softplus would do
-    the same at several times the cost.)
-
-    Args:
-        value: any tensor.
-        low: lower bound, approached and never passed.
-        high: upper bound, approached and never passed.
-
-    Returns:
-        A tensor of the same shape with values in ``[low, high]``.
-
-    Examples:
-        >>> import torch
-        >>> soft_clamp(torch.tensor([-1000.0, 1.5, 1000.0]), -10.0, 10.0).round(decimals=2)
-        tensor([-10.0000,   1.5000,  10.0000])
-    """
-    margin = min(1.0, (high - low) / 4)
-    inside = value.clamp(low + margin, high - margin)
-    excess = value - inside
-    # Not m e / (m + |e|): infinity over infinity.
-    return inside + excess.sign() * (margin - margin**2 / (margin + excess.abs()))
 
 
 class Head(nn.Module):
@@ -51,11 +25,16 @@ class Head(nn.Module):
 
     ``forward(features (*B, F), constants (C,)) -> Distribution`` with batch ``*B`` and event ``(D,)``,
     where ``F = num_features(D)`` and ``C = num_constants(D)``. The first ``D`` features are the mean.
+    A head that has no parameters and only broadcasts says so by ``stackable = True``: it is then called
+    with features ``(N, R, F)`` and constants ``(N, 1, C)`` of several models at once
+    (:func:`~torchrl_vjepa.stacking.linear`).
 
     Examples:
         >>> DeltaHead().num_features(4), DeltaHead().num_constants(4)
         (4, 0)
     """
+
+    stackable = False
 
     def num_features(self, latent_dim: int) -> int:
         """Number of state-dependent features for a latent of ``latent_dim``.
@@ -91,6 +70,8 @@ class DeltaHead(Head):
         torch.Size([2, 3])
     """
 
+    stackable = True
+
     def forward(self, features: Tensor, constants: Tensor) -> Delta:
         """Point mass on the features.
 
@@ -114,7 +95,8 @@ class DiagGaussianHead(Head):
         scale: ``"state"``: :math:`\log \sigma^2_\phi(Z_C)` is a second output of the trunk, as in the
             paper; ``"constant"``: one learned log-variance per skip and dimension, which is exact for
             linear-Gaussian systems.
-        log_var_range: ``(low, high)`` of the log-variance, in nats.
+        log_var_range: ``(low, high)`` of the log-variance, in nats; ``None`` leaves it unbounded, as the
+            paper prints it.
 
     Raises:
         ValueError: if ``scale`` is unknown or the range is empty or infinite.
@@ -127,11 +109,13 @@ class DiagGaussianHead(Head):
         (torch.Size([5]), torch.Size([3]), tensor([1., 1., 1.]))
     """
 
+    stackable = True
+
     def __init__(
         self,
         scale: Literal["state", "constant"] = "state",
         *,
-        log_var_range: tuple[float, float] = (-16.0, 16.0),
+        log_var_range: tuple[float, float] | None = (-16.0, 16.0),
     ) -> None:
         super().__init__()
         if scale not in ("state", "constant"):
@@ -172,13 +156,15 @@ class DiagGaussianHead(Head):
             Diagonal Gaussian with batch ``*B`` and event ``(D,)``.
         """
         if self.scale == "state":
-            loc, log_var = features.chunk(2, dim=-1)
+            loc, log_var = halves(features)
         else:
             loc, log_var = features, constants
-        return diag_gaussian(loc, (0.5 * soft_clamp(log_var, *self.log_var_range)).exp())
+        return diag_gaussian(loc, log_var=log_var, log_var_range=self.log_var_range)
 
 
-def _checked_range(log_var_range: tuple[float, float]) -> tuple[float, float]:
+def _checked_range(log_var_range: tuple[float, float] | None) -> tuple[float, float] | None:
+    if log_var_range is None:
+        return None
     low, high = (float(bound) for bound in log_var_range)
     if not -math.inf < low < high < math.inf:
         raise ValueError(f"log_var_range must be finite (low, high) with low < high, got {log_var_range}")
@@ -197,7 +183,7 @@ class TargetScale(nn.Module):
         kind: ``"linear"``: :math:`\log\sigma^2 = W x`, the second linear head of the paper's target
             encoder; ``"learned"``: one learned log-variance per dimension; ``"constant"``: fixed.
         init_std: standard deviation at the start (``"learned"``, ``"constant"``), in units of the latent.
-        log_var_range: the log-variance is softly clamped to it, in nats.
+        log_var_range: the log-variance is softly clamped to it, in nats; ``None`` leaves it unbounded.
 
     Raises:
         ValueError: if sizes are not positive, ``init_std`` is outside of the range, or ``kind`` is unknown.
@@ -208,6 +194,8 @@ class TargetScale(nn.Module):
         tensor([0.5000, 0.5000, 0.5000])
     """
 
+    stackable = True
+
     def __init__(
         self,
         latent_dim: int,
@@ -215,7 +203,7 @@ class TargetScale(nn.Module):
         *,
         kind: TargetScaleKind = "learned",
         init_std: float = 1.0,
-        log_var_range: tuple[float, float] = (-16.0, 16.0),
+        log_var_range: tuple[float, float] | None = (-16.0, 16.0),
     ) -> None:
         super().__init__()
         if kind not in get_args(TargetScaleKind):
@@ -229,7 +217,8 @@ class TargetScale(nn.Module):
         self.latent_dim = latent_dim
         self.kind = kind
         self.init_std = float(init_std)
-        low, high = self.log_var_range = _checked_range(log_var_range)
+        self.log_var_range = _checked_range(log_var_range)
+        low, high = self.log_var_range or (-math.inf, math.inf)
         if kind != "linear" and not low <= 2.0 * math.log(self.init_std) <= high:
             raise ValueError(
                 f"init_std must have a log-variance in log_var_range={log_var_range}, got "
@@ -250,6 +239,21 @@ class TargetScale(nn.Module):
             with torch.no_grad():
                 self.log_var.fill_(2.0 * math.log(self.init_std))
 
+    def log_variance(self, observation: Tensor) -> Tensor:
+        r"""Log-variance :math:`\log \sigma^2_{\theta'}` of the target.
+
+        Args:
+            observation: target observation, of shape ``(*B, O)``.
+
+        Returns:
+            Of shape ``(*B, D)``; ``(D,)`` where it does not depend on the observation.
+        """
+        if self.kind == "linear":
+            log_var = linear(observation, self.linear.weight)
+        else:
+            log_var = self.log_var if self.log_var.ndim == 1 else self.log_var.unsqueeze(-2)
+        return log_var if self.log_var_range is None else soft_clamp(log_var, *self.log_var_range)
+
     def forward(self, observation: Tensor) -> Tensor:
         """Standard deviation of the target.
 
@@ -260,5 +264,4 @@ class TargetScale(nn.Module):
             Standard deviations of shape ``(*B, D)``; ``(D,)`` where they do not depend on the
             observation.
         """
-        log_var = self.linear(observation) if self.kind == "linear" else self.log_var
-        return (0.5 * soft_clamp(log_var, *self.log_var_range)).exp()
+        return (0.5 * self.log_variance(observation)).exp()

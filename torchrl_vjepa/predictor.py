@@ -15,6 +15,7 @@ from torchrl.modules import MLP
 
 from torchrl_vjepa.distributions import point_estimate, product_of_experts
 from torchrl_vjepa.heads import DiagGaussianHead, Head
+from torchrl_vjepa.stacking import linear
 from torchrl_vjepa.windows import read
 
 __all__ = ["FusedPredictor", "Predictor"]
@@ -248,13 +249,19 @@ class Predictor(_Transition):
                 f"latent, action and side_info must have the dtype of the predictor's weights, {dtype}, "
                 f"got {[item.dtype for item in (latent, action, side_info) if item is not None]}; cast them"
             )
-        features = trunk(joined)
+        features = linear(joined, trunk.weight, trunk.bias) if self.trunk == "linear" else trunk(joined)
         if self.residual:
             features = torch.cat(
                 [features[..., : self.latent_dim] + latent, features[..., self.latent_dim :]],
                 dim=-1,
             )
-        return self.head(features, self.constants[index])
+        constants = self.constants[index] if self.constants.ndim == 2 else self.constants[:, index, None]
+        return self.head(features, constants)
+
+    @property
+    def stackable(self) -> bool:
+        """Whether :meth:`dist` takes the stacked weights of several models (``linear``)."""
+        return self.trunk == "linear" and self.head.stackable
 
     def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
         batch = latent.shape[:-1]

@@ -79,6 +79,11 @@ class GaussianPrior(nn.Module):
                 self.register_buffer(name, value.clone())
         self._initial = {name: value.clone() for name, value in entries.items()}
 
+    @property
+    def stackable(self) -> bool:
+        """Whether it takes the stacked parameters of several models: the diagonal one does."""
+        return hasattr(self, "log_var")
+
     def reset_parameters(self) -> None:
         """Back to the Gaussian that was given."""
         with torch.no_grad():
@@ -95,7 +100,10 @@ class GaussianPrior(nn.Module):
             Distribution with empty batch and event ``(D,)``.
         """
         if hasattr(self, "log_var"):
-            return diag_gaussian(self.mean, (0.5 * self.log_var).exp())
+            mean, log_var = self.mean, self.log_var
+            if mean.ndim == 2:  # of several models: the rows of each share it
+                mean, log_var = mean.unsqueeze(-2), log_var.unsqueeze(-2)
+            return diag_gaussian(mean, log_var=log_var)
         factor = self.lower.tril(-1) + torch.diag_embed(self.log_diagonal.exp())
         return MultivariateNormal(self.mean, scale_tril=factor, validate_args=False)
 

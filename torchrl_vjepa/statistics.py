@@ -1,7 +1,8 @@
 """What a batch of latents looks like: moments, entropy, effective rank, distance to a Gaussian.
 
 Everything here is masked by weights instead of boolean indexing, so that it runs under
-``torch.func.vmap`` (several models at once) and ``torch.compile`` without leaving the graph.
+``torch.func.vmap`` and ``torch.compile`` without leaving the graph. What the losses call takes
+several sets of rows at once (one for each model).
 """
 
 from __future__ import annotations
@@ -11,13 +12,20 @@ import math
 import torch
 from torch import Tensor
 
+from torchrl_vjepa.stacking import products
+
 __all__ = [
     "covariance_entropy",
     "covariance_rank",
     "effective_rank",
+    "eigenvalues",
     "gaussian_entropy",
     "masked_moments",
+    "row_distance",
+    "row_moments",
     "sliced_gaussian_distance",
+    "spectrum_entropy",
+    "spectrum_rank",
 ]
 
 
@@ -53,25 +61,43 @@ def masked_moments(x: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tenso
         >>> mean.tolist(), covariance.tolist()
         ([1.0, 1.0], [[1.0, 0.0], [0.0, 0.0]])
     """
-    x, mask = _as_rows(x, mask)
+    return row_moments(*_as_rows(x, mask))
+
+
+def row_moments(x: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of rows, for several sets of them at once; see :func:`masked_moments`.
+
+    Args:
+        x: Samples, shape ``(*N, R, D)``, at least float32 and one row: ``*N`` sets of ``R`` rows.
+        mask: Boolean, shape ``(R,)`` or ``(*N, R)``; ``False`` marks a row that does not count.
+
+    Returns:
+        ``mean`` of shape ``(*N, D)`` and ``covariance`` of shape ``(*N, D, D)``.
+
+    Examples:
+        >>> import torch
+        >>> mean, covariance = row_moments(torch.tensor([[[0.0], [2.0]], [[1.0], [1.0]]]))
+        >>> mean.flatten().tolist(), covariance.flatten().tolist()
+        ([1.0, 1.0], [1.0, 0.0])
+    """
     with torch.autocast(device_type=x.device.type, enabled=False):
         # Moments around one of the samples, not around zero: constant rows give exactly zero
         # variance, and a large common offset costs no digits.
         if mask is None:
-            count = torch.tensor(x.shape[0], dtype=x.dtype, device=x.device)
-            shift = x[0].detach()
+            count: Tensor | int = x.shape[-2]
+            shift = x[..., :1, :].detach()
             shifted = x - shift
         else:
-            count = mask.sum().to(x.dtype).clamp(min=1)
+            first = mask.to(torch.uint8).argmax(-1)[..., None, None]
+            mask = mask.unsqueeze(-1)
+            count = mask.sum((-2, -1)).to(x.dtype).clamp(min=1)[..., None]
             x = torch.where(mask, x, 0)
-            shift = x.index_select(0, mask.to(torch.uint8).argmax(0)).squeeze(0).detach()
+            shift = x.detach().take_along_dim(first.expand(*x.shape[:-2], 1, x.shape[-1]), -2)
             shifted = torch.where(mask, x - shift, 0)
-        mean = shifted.sum(0) / count
-        centered = shifted - mean
-        if mask is not None:
-            centered = torch.where(mask, centered, 0)
-        covariance = centered.mT @ centered / count
-    return shift + mean, covariance
+        mean = shifted.sum(-2) / count
+        scale = count.unsqueeze(-1) if isinstance(count, Tensor) else count
+        covariance = products(shifted) / scale - mean.unsqueeze(-1) * mean.unsqueeze(-2)
+    return shift.squeeze(-2) + mean, covariance
 
 
 def gaussian_entropy(latents: Tensor, mask: Tensor | None = None, *, eps: float = 1e-6) -> Tensor:
@@ -114,11 +140,11 @@ def covariance_entropy(covariance: Tensor, *, eps: float = 1e-6) -> Tensor:
     r"""Entropy of a Gaussian with this covariance, in nats; see :func:`gaussian_entropy`.
 
     Args:
-        covariance: Shape ``(D, D)``, symmetric.
+        covariance: Shape ``(*N, D, D)``, symmetric.
         eps: Variance added to every direction, above 0.
 
     Returns:
-        A scalar. NaN if the covariance is not finite.
+        Shape ``(*N)``. NaN where the covariance is not finite.
 
     Raises:
         ValueError: If ``eps`` is not positive.
@@ -130,8 +156,45 @@ def covariance_entropy(covariance: Tensor, *, eps: float = 1e-6) -> Tensor:
     """
     if not (eps > 0 and math.isfinite(eps)):
         raise ValueError(f"eps must be positive and finite, got {eps}.")
-    variances = _eigenvalues(covariance) + eps
-    return 0.5 * (math.log(2 * math.pi * math.e) + variances.log()).sum()
+    return spectrum_entropy(eigenvalues(covariance), eps=eps)
+
+
+def spectrum_entropy(values: Tensor, *, eps: float = 1e-6) -> Tensor:
+    r"""Entropy of a Gaussian whose covariance has these eigenvalues, in nats; see :func:`gaussian_entropy`.
+
+    Args:
+        values: Shape ``(*N, D)``, at least 0: what :func:`eigenvalues` gives.
+        eps: Variance added to every direction, above 0.
+
+    Returns:
+        Shape ``(*N)``.
+
+    Examples:
+        >>> import torch
+        >>> round(spectrum_entropy(torch.ones(2)).item(), 3)
+        2.838
+    """
+    return 0.5 * ((values + eps).log().sum(-1) + values.shape[-1] * math.log(2 * math.pi * math.e))
+
+
+def eigenvalues(covariance: Tensor) -> Tensor:
+    """Variances along the principal directions of a covariance, ascending.
+
+    Args:
+        covariance: Shape ``(*N, D, D)``, symmetric.
+
+    Returns:
+        Shape ``(*N, D)``, at least 0; NaN where the covariance is not finite, instead of an exception.
+
+    Examples:
+        >>> import torch
+        >>> eigenvalues(torch.diag(torch.tensor([2.0, 1.0])))
+        tensor([1., 2.])
+    """
+    finite = covariance.isfinite().all(-1).all(-1)[..., None, None]
+    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    values = torch.linalg.eigvalsh(torch.where(finite, covariance, identity)).clamp(min=0)
+    return torch.where(finite.squeeze(-1), values, math.nan)
 
 
 def effective_rank(latents: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -174,25 +237,41 @@ def covariance_rank(covariance: Tensor) -> Tensor:
     r"""Effective rank of a covariance; see :func:`effective_rank`.
 
     Args:
-        covariance: Shape ``(D, D)``, symmetric.
+        covariance: Shape ``(*N, D, D)``, symmetric.
 
     Returns:
-        A scalar in ``[1, D]``; 0 for a zero covariance, NaN if it is not finite.
+        Shape ``(*N)``, in ``[1, D]``; 0 for a zero covariance, NaN if it is not finite.
 
     Examples:
         >>> import torch
         >>> round(covariance_rank(torch.eye(3)).item(), 4)
         3.0
     """
-    # Divided by the total before the eigenvalues: their absolute errors stay far below 1 whatever
-    # the units of the latents.
-    total = covariance.diagonal().sum()
-    scaled = covariance / torch.where(total > 0, total, torch.ones_like(total))
-    values = _eigenvalues(scaled)
-    share = values / torch.where(total > 0, values.sum(), torch.ones_like(total))
-    rank = torch.exp(-torch.special.xlogy(share, share).sum())
-    rank = rank.clamp(max=covariance.shape[-1])  # equal shares round above D
-    return torch.where(total == 0, torch.zeros_like(rank), rank)
+    return spectrum_rank(eigenvalues(covariance))
+
+
+def spectrum_rank(values: Tensor) -> Tensor:
+    r"""Effective rank of a covariance that has these eigenvalues; see :func:`effective_rank`.
+
+    Args:
+        values: Shape ``(*N, D)``, at least 0: what :func:`eigenvalues` gives.
+
+    Returns:
+        Shape ``(*N)``, in ``[1, D]``; 0 if all are zero, NaN if they are not finite.
+
+    Examples:
+        >>> import torch
+        >>> round(spectrum_rank(torch.ones(3)).item(), 4)
+        3.0
+    """
+    # By the largest first: the sum of huge ones could overflow, and tiny ones would vanish.
+    largest = values[..., -1:]
+    scaled = values / torch.where(largest > 0, largest, 1)
+    total = scaled.sum(-1, keepdim=True)
+    share = scaled / torch.where(total > 0, total, 1)
+    rank = torch.exp(-torch.special.xlogy(share, share).sum(-1))
+    rank = rank.clamp(max=values.shape[-1])  # equal shares round above D
+    return torch.where(total.squeeze(-1) == 0, 0, rank)
 
 
 def sliced_gaussian_distance(
@@ -250,8 +329,36 @@ def sliced_gaussian_distance(
         if value < least:
             raise ValueError(f"{name} must be at least {least}, got {value}.")
     x, mask = _as_rows(latents, mask)
+    return row_distance(x, mask, num_slices=num_slices, num_points=num_points, generator=generator)
+
+
+def row_distance(
+    x: Tensor,
+    mask: Tensor | None = None,
+    *,
+    num_slices: int = 64,
+    num_points: int = 17,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """:func:`sliced_gaussian_distance` of several sets of rows at once, with the same directions.
+
+    Args:
+        x: Shape ``(*N, R, D)``, at least float32.
+        mask: Boolean, shape ``(R,)`` or ``(*N, R)``; ``False`` marks a row that does not count.
+        num_slices: See :func:`sliced_gaussian_distance`.
+        num_points: See :func:`sliced_gaussian_distance`.
+        generator: See :func:`sliced_gaussian_distance`.
+
+    Returns:
+        Shape ``(*N)``.
+
+    Examples:
+        >>> import torch
+        >>> row_distance(torch.zeros(2, 100, 3)).shape
+        torch.Size([2])
+    """
     with torch.autocast(device_type=x.device.type, enabled=False):
-        directions = torch.randn(x.shape[1], num_slices, generator=generator, dtype=x.dtype, device=x.device)
+        directions = torch.randn(x.shape[-1], num_slices, generator=generator, dtype=x.dtype, device=x.device)
         directions = directions / directions.norm(dim=0)
         t = torch.linspace(0, 5, num_points, dtype=x.dtype, device=x.device)
         step = 5 / (num_points - 1)
@@ -259,29 +366,20 @@ def sliced_gaussian_distance(
         # Twice the half-line: the integrand is even. It vanishes at both ends, so they need no halving.
         weight = 2 * step / math.sqrt(2 * math.pi) * gaussian
         if mask is not None:
-            x = torch.where(mask, x, 0)
-        angle = (x @ directions).unsqueeze(-1) * t
+            x = torch.where(mask.unsqueeze(-1), x, 0)
+        angle = (x @ directions).unsqueeze(-1) * t  # (*N, R, S, P)
         if mask is None:
-            real, imaginary = angle.cos().mean(0), angle.sin().mean(0)
-            return (((real - gaussian).square() + imaginary.square()) @ weight).mean()
-        count = mask.sum().to(x.dtype)
-        row = mask.to(x.dtype).squeeze(-1) / count.clamp(min=1)
-        real = torch.tensordot(row, angle.cos(), dims=1)
-        imaginary = torch.tensordot(row, angle.sin(), dims=1)
-        distance = (((real - gaussian).square() + imaginary.square()) @ weight).mean()
-        return torch.where(count > 0, distance, 0)
-
-
-def _eigenvalues(covariance: Tensor) -> Tensor:
-    """Non-negative eigenvalues of a covariance; NaN where it is not finite, instead of raising."""
-    finite = torch.isfinite(covariance).all()
-    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    values = torch.linalg.eigvalsh(torch.where(finite, covariance, identity)).clamp(min=0)
-    return torch.where(finite, values, torch.full_like(values, math.nan))
+            real, imaginary = angle.cos().mean(-3), angle.sin().mean(-3)
+            return (((real - gaussian).square() + imaginary.square()) @ weight).mean(-1)
+        count = mask.sum(-1, keepdim=True).to(x.dtype)
+        row = (mask.to(x.dtype) / count.clamp(min=1))[..., None, None]
+        real, imaginary = (row * angle.cos()).sum(-3), (row * angle.sin()).sum(-3)
+        distance = (((real - gaussian).square() + imaginary.square()) @ weight).mean(-1)
+        return torch.where(count.squeeze(-1) > 0, distance, 0)
 
 
 def _as_rows(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Check and flatten samples to ``(N, D)`` (at least float32) and the mask to ``(N, 1)``."""
+    """Check and flatten samples to ``(R, D)`` (at least float32) and the mask to ``(R,)``."""
     if not x.is_floating_point():
         raise TypeError(f"Samples must be floating point, got {x.dtype}; cast them first.")
     if x.ndim == 0 or x.shape[-1] == 0 or x.numel() == 0:
@@ -297,7 +395,7 @@ def _as_rows(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
                 f"mask must have shape {tuple(batch)} or {(*batch, 1)} to fit samples of shape "
                 f"{tuple(x.shape)}, got {tuple(mask.shape)}."
             )
-        mask = mask.reshape(-1, 1)
+        mask = mask.reshape(-1)
     if x.dtype in (torch.float16, torch.bfloat16):
         x = x.float()
     return x.reshape(-1, x.shape[-1]), mask

@@ -1,18 +1,23 @@
 """The losses of the paper as TorchRL LossModules."""
 
+from torchrl_vjepa.objectives.balancing import AdaptiveCoefficient
 from torchrl_vjepa.objectives.base import CollapseWarning, LatentPredictionLoss
 from torchrl_vjepa.objectives.bjepa import BJEPALoss
 from torchrl_vjepa.objectives.jepa import JEPALoss
 from torchrl_vjepa.objectives.reward import RewardLoss
+from torchrl_vjepa.objectives.selection import Selection, select_best
 from torchrl_vjepa.objectives.vjepa import VJEPALoss
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 
 __all__ = [
+    "AdaptiveCoefficient",
     "BJEPALoss",
     "CollapseWarning",
     "JEPALoss",
     "LatentPredictionLoss",
     "RewardLoss",
+    "Selection",
     "VJEPALoss",
     "WindowLoss",
+    "select_best",
 ]

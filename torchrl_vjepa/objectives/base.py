@@ -13,14 +13,16 @@ from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
 from torchrl_vjepa.models import JEPA
-from torchrl_vjepa.objectives.pairs import Pairs
+from torchrl_vjepa.objectives.pairs import Pairs, mean_over, rows_of
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 from torchrl_vjepa.predictor import Predictor
+from torchrl_vjepa.stacking import features_first
 from torchrl_vjepa.statistics import (
-    covariance_entropy,
-    covariance_rank,
-    masked_moments,
-    sliced_gaussian_distance,
+    eigenvalues,
+    row_distance,
+    row_moments,
+    spectrum_entropy,
+    spectrum_rank,
 )
 from torchrl_vjepa.windows import action_chunks
 
@@ -155,18 +157,17 @@ class LatentPredictionLoss(WindowLoss):
 
     # What a member adds
 
-    def _target(self, latent: Tensor, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
-        """What is predicted, given the latents of the target encoder; ``(B, T, D)`` both."""
-        return latent
+    def _target(
+        self, outputs: dict[str, Tensor], data: TensorDictBase, params: dict[str, TensorDictBase]
+    ) -> Tensor:
+        """What is predicted, ``(B, T, D)``: by default the latents of the target encoder."""
+        return outputs["target"]
 
-    def _member_terms(
-        self,
-        pairs: list[Pairs],
-        target_latent: Tensor,
-        data: TensorDictBase,
-        mask: Tensor | None,
-        params: dict[str, TensorDictBase],
-    ) -> dict[str, Tensor]:
+    def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
+        """What the member needs of each pair, ``(R, ...)``; mapped over the models."""
+        raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
+
+    def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
         """The member's own ``loss_*`` entries and diagnostics."""
         raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
 
@@ -184,63 +185,107 @@ class LatentPredictionLoss(WindowLoss):
             target.set(key, self.encoder_params.get(key))
         return target
 
-    def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
-    ) -> dict[str, Tensor]:
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
         named = dict(zip(("target", *self._modules_of_model), params, strict=True))
         predictor = self.predictor
-        mask = masks.get("steps")
         latent = self._encode(data, named["encoder"], predictor.latent_key)
         with torch.no_grad():
             target_latent = self._encode(data, named["target"], predictor.latent_key)
-        target = self._target(target_latent, data, named)
+        outputs = {"latent": latent, "target": target_latent}
+        target = self._target(outputs, data, named)
         action = data.get(predictor.action_key) if predictor.action_dim else None
         side_info = data.get(predictor.side_info_key) if predictor.side_info_dim else None
-        pairs = []
         with named["predictor"].to_module(predictor):
             for skip in predictor.skips:
-                context = latent[:, :-skip]
-                chunks = None if action is None else action_chunks(action, skip)
-                info = None if side_info is None else side_info[:, skip:]
+                context = self._flat(latent, slice(-skip))
+                chunks = info = None
+                if action is not None:
+                    chunks = _like(context, action_chunks(action, skip).flatten(-4, -3), 2)
+                if side_info is not None:
+                    info = _like(context, side_info[..., skip:, :].flatten(-3, -2), 1)
                 p = predictor.dist(context, chunks, skip=skip, side_info=info)
-                pair_target = target[:, skip:]
-                pairs.append(Pairs(skip, p, pair_target, context, chunks, info, masks.get(str(skip))))
-            with torch.autocast(latent.device.type, enabled=False):
-                terms = self._member_terms(pairs, target_latent, data, mask, named)
+                pairs = Pairs(skip, p, self._flat(target, slice(skip, None)), context, chunks, info)
+                with torch.autocast(latent.device.type, enabled=False):
+                    of_pairs = self._pair_outputs(pairs, named)
+                outputs.update({f"{name}_{skip}": value for name, value in of_pairs.items()})
+        return outputs
+
+    def _terms(
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
+    ) -> dict[str, Tensor]:
+        latent = outputs["latent"]
+        rows = features_first(latent)
+        mask = rows_of(masks.get("steps"))
         with torch.autocast(latent.device.type, enabled=False):
-            mean, covariance = masked_moments(latent, mask)
-            terms.update(self._regularisers(mean, covariance))
+            terms = self._member_terms(outputs, masks)
+            # Without a regulariser the moments are diagnostics: no gradient flows through them.
+            coeffs = ("variance_coeff", "covariance_coeff", "marginal_entropy_coeff")
+            moved = any(map(self._is_active, coeffs))
+            if moved or self._wants_diagnostics or self.reduction == "none":
+                with torch.set_grad_enabled(moved and torch.is_grad_enabled()):
+                    mean, covariance = row_moments(rows, mask)
+                    values = eigenvalues(covariance)
+                    terms.update(self._regularisers(mean, covariance, values))
+            else:
+                zero = latent.new_zeros(latent.shape[:-3])
+                terms |= {"loss_variance": zero, "loss_covariance": zero, "loss_entropy": zero}
             if self.sliced_entropy_coeff is not None:
-                distance = sliced_gaussian_distance(latent, mask, num_slices=self.num_slices)
+                distance = row_distance(rows, mask, num_slices=self.num_slices)
                 terms["loss_sliced"] = self.sliced_entropy_coeff * distance
-            if self.reduction != "none":
-                covariance = covariance.detach()
-                terms["effective_rank"] = covariance_rank(covariance)
-                terms["latent_std"] = covariance.diagonal().clamp_min(0).sqrt().mean()
+            if self._wants_diagnostics:
+                terms["effective_rank"] = spectrum_rank(values.detach())
+                deviations = covariance.detach().diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+                terms["latent_std"] = deviations.mean(-1)
         if self.reduction == "none":
+            # Regularisers belong to the batch: the same number at every step.
+            shape = latent.shape[:-1]
             terms = {
-                key: value.expand(latent.shape[:2]) if value.ndim == 0 else value
+                key: value if value.shape == shape else value[..., None, None].expand(shape)
                 for key, value in terms.items()
                 if key.startswith("loss_")
             }
         return terms
 
-    def _reduce_pairs(self, values: list[Tensor], pairs: list[Pairs]) -> Tensor:
-        length = pairs[0].target.shape[1] + pairs[0].skip
-        return self._reduce(values, [pair.mask for pair in pairs], length)
+    def _is_active(self, coeff: str) -> bool:
+        """Whether a coefficient may be other than zero; only on a CPU looking costs nothing."""
+        value = getattr(self, coeff)
+        return torch.compiler.is_compiling() or value.device.type != "cpu" or bool((value != 0).any())
 
-    def _regularisers(self, mean: Tensor, covariance: Tensor) -> dict[str, Tensor]:
-        variance = covariance.diagonal()
+    def _pad_pairs(self, name: str, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> Tensor:
+        """For ``reduction="none"``: the entries ``name`` of all skips as ``(*N, B, T)``."""
+        length, skips = outputs["latent"].shape[-2], self.predictor.skips
+        windows = [outputs[f"{name}_{skip}"].unflatten(-1, (-1, length - skip)) for skip in skips]
+        return self._reduce(windows, [masks.get(str(skip)) for skip in skips], length)
+
+    def _pair_means(self, name: str, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> list[Tensor]:
+        """For each skip the mean of the entry ``name`` over the pairs that count, ``(*N)``."""
+        return [mean_over(outputs[f"{name}_{skip}"], rows_of(masks.get(str(skip)))) for skip in self.skips]
+
+    def _reduce_means(
+        self, means: list[Tensor], outputs: dict[str, Tensor], masks: dict[str, Tensor]
+    ) -> Tensor:
+        """Reduce the means over pairs of each skip over the skips."""
+        if self.reduction == "sum":
+            *_, windows, length, _ = outputs["latent"].shape
+            counts = [
+                windows * (length - skip) if mask is None else mask.sum((-2, -1))
+                for skip, mask in ((skip, masks.get(str(skip))) for skip in self.skips)
+            ]
+            means = [mean * count for mean, count in zip(means, counts, strict=True)]
+        return self._over_skips(means)
+
+    def _regularisers(self, mean: Tensor, covariance: Tensor, values: Tensor) -> dict[str, Tensor]:
+        variance = covariance.diagonal(dim1=-2, dim2=-1)
         dim = mean.shape[-1]
-        off_diagonal = covariance.pow(2).sum() - variance.pow(2).sum()
+        off_diagonal = covariance.square().sum((-2, -1)) - variance.square().sum(-1)
         # KL(N(m, S) || N(0, I)) = (tr S + |m|^2 - D - log det S) / 2; the entropy is the log det's half.
-        trace = variance.sum() + mean.pow(2).sum()
+        trace = (variance + mean.square()).sum(-1)
         gaussian_constant = 0.5 * dim * math.log(2 * math.pi)
-        entropy = covariance_entropy(covariance)
+        divergence = 0.5 * trace + gaussian_constant - spectrum_entropy(values)
         return {
-            "loss_variance": self.variance_coeff * (1 - (variance + 1e-4).sqrt()).relu().mean(),
+            "loss_variance": self.variance_coeff * (1 - (variance + 1e-4).sqrt()).relu().mean(-1),
             "loss_covariance": self.covariance_coeff * off_diagonal / dim,
-            "loss_entropy": self.marginal_entropy_coeff * (0.5 * trace + gaussian_constant - entropy),
+            "loss_entropy": self.marginal_entropy_coeff * divergence,
         }
 
     def _watch(self, terms: dict[str, Tensor]) -> None:
@@ -261,3 +306,8 @@ class LatentPredictionLoss(WindowLoss):
                 CollapseWarning,
                 stacklevel=3,
             )
+
+
+def _like(context: Tensor, value: Tensor, event_dims: int) -> Tensor:
+    """What all models share, ``(R, *event)``, with the dimension of models of the contexts."""
+    return value.expand(*context.shape[:-1], *value.shape[-event_dims:])

@@ -73,23 +73,22 @@ class BJEPALoss(VJEPALoss):
         yield from super()._diagnostic_keys()
         yield "structural_kl"
 
-    def _member_terms(
-        self,
-        pairs: list[Pairs],
-        target_latent: Tensor,
-        data: TensorDictBase,
-        mask: Tensor | None,
-        params: dict[str, TensorDictBase],
-    ) -> dict[str, Tensor]:
-        terms = super()._member_terms(pairs, target_latent, data, mask, params)
+    def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
+        outputs = super()._pair_outputs(pairs, params)
         with params["prior"].to_module(self.prior):
-            prior = self.prior.module()
-            kls = [_kl(pair.dist, prior) for pair in pairs]
-        terms["loss_structural_kl"] = self.structural_kl_coeff * self._reduce_pairs(kls, pairs)
-        if self.reduction != "none":
-            means = [pair.mean(kl) for pair, kl in zip(pairs, kls, strict=True)]
-            weighted = [w * mean for w, mean in zip(self.skip_weights, means, strict=True)]
-            terms["structural_kl"] = torch.stack(weighted).sum().detach()
+            outputs["structural"] = _kl(pairs.dist, self.prior.module())
+        return outputs
+
+    def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        terms = super()._member_terms(outputs, masks)
+        if self.reduction == "none":
+            structural = self._pad_pairs("structural", outputs, masks)
+        else:
+            means = self._pair_means("structural", outputs, masks)
+            structural = self._reduce_means(means, outputs, masks)
+            if self._wants_diagnostics:
+                terms["structural_kl"] = self._over_skips(means).detach()
+        terms["loss_structural_kl"] = self.structural_kl_coeff * structural
         return terms
 
 

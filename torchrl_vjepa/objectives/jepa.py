@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_vjepa.models import JEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
 from torchrl_vjepa.objectives.pairs import Pairs
+from torchrl_vjepa.stacking import squared_distance
 
 __all__ = ["JEPALoss"]
 
@@ -47,7 +48,7 @@ class JEPALoss(LatentPredictionLoss):
 
     Examples:
         >>> import torch
-        >>> from tensordict import TensorDict
+            >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_vjepa import JEPA, DeltaHead, Predictor, linear_encoder
         >>> model = JEPA(linear_encoder(20, 4), Predictor(4, action_dim=2, head=DeltaHead()))
@@ -100,16 +101,15 @@ class JEPALoss(LatentPredictionLoss):
         yield from super()._diagnostic_keys()
         yield from (f"error_skip_{skip}" for skip in self.predictor.skips)
 
-    def _member_terms(
-        self,
-        pairs: list[Pairs],
-        target_latent: Tensor,
-        data: TensorDictBase,
-        mask: Tensor | None,
-        params: dict[str, TensorDictBase],
-    ) -> dict[str, Tensor]:
-        errors = [(pair.dist.mean - pair.target).pow(2).sum(-1) for pair in pairs]
-        terms = {"loss_prediction": self.prediction_coeff * self._reduce_pairs(errors, pairs)}
-        for pair, error in zip(pairs, errors, strict=True):
-            terms[f"error_skip_{pair.skip}"] = pair.mean(error).detach()
+    def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
+        return {"error": squared_distance(pairs.dist.mean, pairs.target)}
+
+    def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        if self.reduction == "none":
+            return {"loss_prediction": self.prediction_coeff * self._pad_pairs("error", outputs, masks)}
+        errors = self._pair_means("error", outputs, masks)
+        terms = {"loss_prediction": self.prediction_coeff * self._reduce_means(errors, outputs, masks)}
+        if self._wants_diagnostics:
+            pairs = zip(self.skips, errors, strict=True)
+            terms |= {f"error_skip_{skip}": error.detach() for skip, error in pairs}
         return terms

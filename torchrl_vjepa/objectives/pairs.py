@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-__all__ = ["Pairs"]
+from torchrl_vjepa.stacking import products
+
+__all__ = ["Pairs", "mean_over", "rows_of", "second_moment"]
 
 
-@dataclass
-class Pairs:
-    r"""All pairs :math:`(t, t + \Delta)` of a batch of windows for one skip.
+class Pairs(NamedTuple):
+    r"""All pairs :math:`(t, t + \Delta)` of one model's windows for one skip, as rows.
+
+    Rows instead of windows: a network that is applied to a matrix, and not to a stack of them, stays one
+    product when several models are mapped over.
 
     Attributes:
         skip: :math:`\Delta`.
-        dist: predictive distribution with batch ``(B, T - skip)``.
-        target: target latents, of shape ``(B, T - skip, D)``.
+        dist: predictive distribution with batch ``(R,)``, where ``R = B (T - skip)``.
+        target: target latents, of shape ``(R, D)``.
         context: context latents, of the same shape.
-        action: action chunks ``(B, T - skip, skip, A)``, or ``None``.
-        side_info: side information ``(B, T - skip, S)``, or ``None``.
-        mask: pairs that count, ``(B, T - skip)``, or ``None`` for all.
+        action: action chunks ``(R, skip, A)``, or ``None``.
+        side_info: side information ``(R, S)``, or ``None``.
 
     Examples:
         >>> import torch
         >>> from torchrl_vjepa import Delta
-        >>> latent = torch.zeros(1, 2, 3)
-        >>> mask = torch.tensor([[True, False]])
-        >>> Pairs(1, Delta(latent), latent, latent, None, None, mask).mean(torch.tensor([[1.0, 9.0]]))
-        tensor(1.)
+        >>> latent = torch.zeros(2, 3)
+        >>> Pairs(1, Delta(latent), latent, latent, None, None).dist.batch_shape
+        torch.Size([2])
     """
 
     skip: int
@@ -39,37 +41,61 @@ class Pairs:
     context: Tensor
     action: Tensor | None
     side_info: Tensor | None
-    mask: Tensor | None
 
-    def __post_init__(self) -> None:
-        """Weights that sum to one over the pairs that count."""
-        if self.mask is not None:
-            weight = self.mask.to(self.target.dtype)
-            self._weight = weight / weight.sum().clamp_min(1)
 
-    def mean(self, value: Tensor) -> Tensor:
-        """Mean over the pairs that count.
+def mean_over(value: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean over the rows that count.
 
-        Args:
-            value: one finite number per pair, ``(B, T - skip)``, or more in trailing dimensions.
+    Args:
+        value: one number per row, ``(*N, R)``; finite where it counts.
+        mask: rows that count, ``(R,)`` or ``(*N, R)``; ``None`` for all.
 
-        Returns:
-            The mean over the first two dimensions; zero if no pair counts.
-        """
-        if self.mask is None:
-            return value.mean((0, 1))
-        return torch.tensordot(self._weight, value, dims=2)
+    Returns:
+        Of shape ``(*N)``; zero where no row counts.
 
-    def second_moment(self, value: Tensor) -> Tensor:
-        """Mean of the outer products over the pairs that count.
+    Examples:
+        >>> import torch
+        >>> mean_over(torch.tensor([1.0, 9.0]), torch.tensor([True, False]))
+        tensor(1.)
+    """
+    if mask is None:
+        return value.mean(-1)
+    return torch.where(mask, value, 0).sum(-1) / mask.sum(-1).clamp_min(1)
 
-        Args:
-            value: one finite vector per pair, ``(B, T - skip, D)``.
 
-        Returns:
-            A matrix of shape ``(D, D)``; zero if no pair counts.
-        """
-        rows = value.reshape(-1, value.shape[-1])
-        if self.mask is None:
-            return rows.mT @ rows / rows.shape[0]
-        return rows.mT @ (rows * self._weight.reshape(-1, 1))
+def rows_of(mask: Tensor | None) -> Tensor | None:
+    """The mask of windows as one of rows.
+
+    Args:
+        mask: ``(*N, B, T)``, or ``None``.
+
+    Returns:
+        ``(*N, B T)``, or ``None``.
+
+    Examples:
+        >>> import torch
+        >>> rows_of(torch.ones(2, 3, dtype=torch.bool)).shape
+        torch.Size([6])
+    """
+    return None if mask is None else mask.flatten(-2)
+
+
+def second_moment(value: Tensor, mask: Tensor | None) -> Tensor:
+    """Mean of the outer products over the rows that count.
+
+    Args:
+        value: one finite vector per row, ``(*N, R, D)``.
+        mask: rows that count, ``(R,)`` or ``(*N, R)``; ``None`` for all.
+
+    Returns:
+        Of shape ``(*N, D, D)``; zero where no row counts.
+
+    Examples:
+        >>> import torch
+        >>> second_moment(torch.tensor([[1.0], [3.0]]), None)
+        tensor([[5.]])
+    """
+    if mask is None:
+        return products(value) / value.shape[-2]
+    count = mask.sum(-1).clamp_min(1)[..., None, None]
+    return products(torch.where(mask.unsqueeze(-1), value, 0)) / count

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrl_vjepa.belief import rollout
 from torchrl_vjepa.models import LatentModel
+from torchrl_vjepa.objectives.pairs import mean_over
 from torchrl_vjepa.objectives.window_loss import WindowLoss
 
 __all__ = ["RewardLoss"]
@@ -164,8 +165,20 @@ class RewardLoss(WindowLoss):
                 chunks = starts.new_zeros(*starts.shape[:-1], steps, 0)
             return rollout(self.predictor.dist, starts, chunks)
 
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
+        chunks = None
+        if self.predictor.action_dim:
+            action = data.get(self.predictor.action_key)
+            chunks = action.unfold(1, self.num_steps, 1).transpose(-1, -2)
+        latents = self._imagine(data, chunks)
+        imagined = TensorDict({self.predictor.latent_key: latents}, batch_size=latents.shape[:-1])
+        if chunks is not None:
+            imagined.set(self.predictor.action_key, chunks)
+        with params[0].to_module(self.reward_model):
+            return {"reward": self.reward_model(imagined).get(self.reward_model.out_keys[0])}
+
     def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
     ) -> dict[str, Tensor]:
         steps, length = self.num_steps, data.shape[1]
         true = data.get(self.tensor_keys.reward)
@@ -174,16 +187,7 @@ class RewardLoss(WindowLoss):
                 f"{self.tensor_keys.reward!r} must have shape {(*data.shape, 1)}, got {tuple(true.shape)}"
             )
         reward = true.unfold(1, steps, 1).transpose(-1, -2)
-        chunks = None
-        if self.predictor.action_dim:
-            action = data.get(self.predictor.action_key)
-            chunks = action.unfold(1, steps, 1).transpose(-1, -2)
-        latents = self._imagine(data, chunks)
-        imagined = TensorDict({self.predictor.latent_key: latents}, batch_size=latents.shape[:-1])
-        if chunks is not None:
-            imagined.set(self.predictor.action_key, chunks)
-        with params[0].to_module(self.reward_model):
-            predicted = self.reward_model(imagined).get(self.reward_model.out_keys[0])
+        predicted = outputs["reward"]
         if predicted.shape != reward.shape:
             raise ValueError(
                 f"reward_model must write rewards of shape {tuple(reward.shape)}, "
@@ -191,10 +195,8 @@ class RewardLoss(WindowLoss):
             )
         error = (predicted - reward).squeeze(-1)
         mask = masks.get(str(steps - 1) if steps > 1 else "steps")
-        terms = {"loss_reward": self._reduce([error.pow(2).mean(-1)], [mask], length)}
+        terms = {"loss_reward": self._reduce([error.square().mean(-1)], [mask], length)}
         if self.reduction != "none":
             absolute = error.detach().abs().mean(-1)
-            if mask is not None:
-                absolute = absolute[mask]
-            terms["reward_error"] = absolute.sum() / max(absolute.numel(), 1)
+            terms["reward_error"] = mean_over(absolute.flatten(), None if mask is None else mask.flatten())
         return terms

@@ -11,11 +11,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
-from torchrl_vjepa.distributions import diag_gaussian
+from torchrl_vjepa.heads import TargetScale
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
-from torchrl_vjepa.objectives.pairs import Pairs
-from torchrl_vjepa.statistics import covariance_entropy, masked_moments
+from torchrl_vjepa.objectives.pairs import Pairs, mean_over, rows_of, second_moment
+from torchrl_vjepa.stacking import columns, features_first, shared_noise
+from torchrl_vjepa.statistics import covariance_entropy, row_moments
 
 __all__ = ["VJEPALoss"]
 
@@ -38,7 +39,8 @@ class VJEPALoss(LatentPredictionLoss):
     Entries: ``loss_nll``, ``loss_target_kl``, ``loss_variance``, ``loss_covariance``, ``loss_entropy``,
     with ``residual_variance="batch"`` also ``loss_head``, with ``sliced_entropy_coeff`` also
     ``loss_sliced``. Diagnostics:
-    ``effective_rank``, ``latent_std``, ``target_std``, ``mutual_information`` (the Gaussian form of
+    ``effective_rank``, ``latent_std``, ``target_kl`` (in nats, without :math:`\beta`), ``target_std``,
+    ``mutual_information`` (the Gaussian form of
     the bound of ``thm:mi_bound``, in nats, mean over skips: the score by which restarts are chosen),
     ``nll_skip_<k>``.
 
@@ -145,72 +147,138 @@ class VJEPALoss(LatentPredictionLoss):
 
     def _diagnostic_keys(self) -> Iterator[str]:
         yield from super()._diagnostic_keys()
-        yield from ("target_std", "mutual_information")
+        yield from ("target_kl", "target_std", "mutual_information")
         yield from (f"nll_skip_{skip}" for skip in self.predictor.skips)
 
-    def _target_std(self, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
+    def _target(
+        self, outputs: dict[str, Tensor], data: TensorDictBase, params: dict[str, TensorDictBase]
+    ) -> Tensor:
+        # Whatever an observation is, the scale reads it as one vector.
+        rows = data.get(self.scale.in_keys[0]).flatten(data.ndim).flatten(-3, -2)
         with params["scale"].to_module(self.scale):
-            # Whatever an observation is, the scale reads it as one vector.
-            std = self.scale.module(data.get(self.scale.in_keys[0]).flatten(2))
-        std = std.float() if std.dtype in (torch.float16, torch.bfloat16) else std
-        return std.detach() if self.target_scale_gradient == "none" else std
+            module = self.scale.module
+            log_var = module.log_variance(rows) if isinstance(module, TargetScale) else 2 * module(rows).log()
+        log_var = log_var.float() if log_var.dtype in (torch.float16, torch.bfloat16) else log_var
+        if log_var.ndim > 1:  # (*N, R, D), or (*N, 1, D) where rows share it
+            shared = log_var.shape[-2] == 1
+            log_var = log_var.unflatten(-2, (1, 1) if shared else data.shape[-2:])
+        if self.target_scale_gradient == "none":
+            log_var = log_var.detach()
+        outputs["target_log_var"] = log_var
+        std = (0.5 * (log_var if self.target_scale_gradient == "both" else log_var.detach())).exp()
+        mean = outputs["target"]
+        return torch.addcmul(mean, std.to(mean.dtype), shared_noise(mean, 3))
 
-    def _target(self, latent: Tensor, data: TensorDictBase, params: dict[str, TensorDictBase]) -> Tensor:
-        std = self._target_std(data, params)
-        if self.target_scale_gradient != "both":
-            std = std.detach()
-        return diag_gaussian(latent, std).rsample()
+    def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
+        if self.residual_variance == "head":
+            return {"nll": -pairs.dist.log_prob(pairs.target)}
+        # The head's own likelihood moves the predictor alone.
+        p = self.predictor.dist(
+            pairs.context.detach(), pairs.action, skip=pairs.skip, side_info=pairs.side_info
+        )
+        return {
+            "residual": pairs.dist.mean - pairs.target,
+            "nll": -p.log_prob(pairs.target.detach()),
+        }
 
-    def _member_terms(
-        self,
-        pairs: list[Pairs],
-        target_latent: Tensor,
-        data: TensorDictBase,
-        mask: Tensor | None,
-        params: dict[str, TensorDictBase],
-    ) -> dict[str, Tensor]:
+    def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        if self.reduction == "none":
+            return self._terms_of_each_pair(outputs, masks)
+        terms = {}
+        head_nlls = self._pair_means("nll", outputs, masks)
+        if self.residual_variance == "head":
+            nlls = head_nlls
+        else:
+            nlls = self._profile_means(outputs, masks)
+            terms["loss_head"] = self._reduce_means(head_nlls, outputs, masks)
+        terms["loss_nll"] = self._reduce_means(nlls, outputs, masks)
+
+        # KL(q || N(0, I)) = (|f|^2 + sum_d (sigma_d^2 - 1 - log sigma_d^2)) / 2
+        rows, mask = features_first(outputs["target"]), rows_of(masks.get("steps"))
+        square = mean_over(rows.square().sum(-1), mask)
+        kl = 0.5 * (square + self._scale_divergence(outputs, mask))
+        terms["loss_target_kl"] = self.target_kl_coeff * kl
+        if self.reduction == "sum":
+            steps = rows.shape[-2] if mask is None else mask.sum(-1)
+            terms["loss_target_kl"] = terms["loss_target_kl"] * steps
+
+        if self._wants_diagnostics:
+            with torch.no_grad():
+                _, covariance = row_moments(rows, mask)
+                variance = self._target_variance(outputs, mask)
+                terms["target_kl"] = kl.detach()
+                terms["target_std"] = variance.sqrt().mean(-1)
+                entropy = covariance_entropy(covariance + torch.diag_embed(variance))
+                terms["mutual_information"] = entropy - self._over_skips(nlls)
+            pairs = zip(self.skips, head_nlls, strict=True)
+            terms |= {f"nll_skip_{skip}": nll.detach() for skip, nll in pairs}
+        return terms
+
+    def _terms_of_each_pair(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The terms for ``reduction="none"``: likelihoods of pairs, divergences of steps."""
         terms = {}
         if self.residual_variance == "head":
-            nlls = head_nlls = [-pair.dist.log_prob(pair.target) for pair in pairs]
+            terms["loss_nll"] = self._pad_pairs("nll", outputs, masks)
         else:
-            nlls = [self._profile_nll(pair) for pair in pairs]
-            head_nlls = [
-                -self.predictor.dist(
-                    pair.context.detach(), pair.action, skip=pair.skip, side_info=pair.side_info
-                ).log_prob(pair.target.detach())
-                for pair in pairs
-            ]
-            terms["loss_head"] = self._reduce_pairs(head_nlls, pairs)
-        terms["loss_nll"] = self._reduce_pairs(nlls, pairs)
-
-        # KL(q || N(0, I)) per step; every step that counts is some pair's target or could be.
-        std = self._target_std(data, params)
-        variance = std.pow(2)
-        kl = 0.5 * (target_latent.pow(2).sum(-1) + (variance - 1 - variance.log()).sum(-1))
-        terms["loss_target_kl"] = self.target_kl_coeff * self._reduce([kl], [mask], kl.shape[1])
-
-        if self.reduction != "none":
-            with torch.no_grad():
-                means = [pair.mean(nll) for pair, nll in zip(pairs, nlls, strict=True)]
-                terms["target_std"] = std.mean()
-                _, covariance = masked_moments(pairs[0].target, pairs[0].mask)
-                nll = sum(w * m for w, m in zip(self.skip_weights, means, strict=True))
-                terms["mutual_information"] = covariance_entropy(covariance) - nll
-                for pair, head_nll in zip(pairs, head_nlls, strict=True):
-                    terms[f"nll_skip_{pair.skip}"] = pair.mean(head_nll).detach()
+            terms["loss_head"] = self._pad_pairs("nll", outputs, masks)
+            profile = self._profile_nlls(outputs, masks)
+            terms["loss_nll"] = self._pad_pairs("profile", {**outputs, **profile}, masks)
+        latent, log_var = outputs["target"], self._log_var(outputs)
+        kl = 0.5 * (latent.square() + log_var.exp() - 1 - log_var).sum(-1)
+        terms["loss_target_kl"] = self.target_kl_coeff * self._reduce(
+            [kl], [masks.get("steps")], kl.shape[-1]
+        )
         return terms
 
     @staticmethod
-    def _profile_nll(pair: Pairs) -> Tensor:
-        """Gaussian likelihood at the residual covariance that is optimal for the batch."""
-        residual = pair.dist.mean - pair.target
-        # At its optimum the covariance has no gradient, so it is a constant here: the gradient is that
-        # of the profile likelihood, log det E[r r^T] / 2.
+    def _log_var(outputs: dict[str, Tensor]) -> Tensor:
+        """Log-variances of the targets, broadcastable to the latents ``(*N, B, T, D)``."""
+        log_var = outputs["target_log_var"]
+        shared = log_var.ndim < outputs["target"].ndim
+        return log_var[..., None, None, :] if shared else log_var
+
+    def _scale_divergence(self, outputs: dict[str, Tensor], mask: Tensor | None) -> Tensor:
+        r"""Mean over steps of :math:`\sum_d (\sigma_d^2 - 1 - \log \sigma_d^2)`, ``(*N)``."""
+        log_var = columns(self._log_var(outputs))
+        excess = (log_var.exp() - log_var).sum(-2) - log_var.shape[-2]
+        return excess[..., 0, 0] if excess.shape[-2:] == (1, 1) else mean_over(excess.flatten(-2), mask)
+
+    def _target_variance(self, outputs: dict[str, Tensor], mask: Tensor | None) -> Tensor:
+        """Mean variance of the targets over steps, ``(*N, D)``."""
+        variance = self._log_var(outputs).exp()
+        if variance.shape[-3:-1] == (1, 1):
+            return variance[..., 0, 0, :]
+        return mean_over(variance.flatten(-3, -2).mT, None if mask is None else mask.unsqueeze(-2))
+
+    def _profile(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Second moments of the residuals, their inverses, and the constants of the likelihoods.
+
+        At its optimum the covariance has no gradient, so it is a constant here: the gradient is that of
+        the profile likelihood, :math:`\frac12 \log\det \mathbb E\, r r^\top`. All skips at once:
+        ``(*N, S, D, D)`` twice, and ``(*N, S)``.
+        """
+        moment = torch.stack(
+            [second_moment(outputs[f"residual_{s}"], rows_of(masks.get(str(s)))) for s in self.skips], dim=-3
+        )
         with torch.no_grad():
-            covariance = pair.second_moment(residual)
-            jitter = 1e-6 * covariance.diagonal().mean() + 1e-12
-            eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-            covariance = covariance + jitter * eye
+            variance = moment.diagonal(dim1=-2, dim2=-1).mean(-1)
+            eye = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
+            covariance = torch.addcmul(moment, (1e-6 * variance + 1e-12)[..., None, None], eye)
             precision = torch.linalg.inv(covariance)
-            constant = torch.logdet(covariance) + covariance.shape[-1] * math.log(2 * math.pi)
-        return 0.5 * ((residual @ precision * residual).sum(-1) + constant)
+            constant = torch.logdet(covariance) + moment.shape[-1] * math.log(2 * math.pi)
+        return moment, precision, constant
+
+    def _profile_means(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> list[Tensor]:
+        """Means of :meth:`_profile_nlls`, which the second moments of the residuals give; each ``(*N)``."""
+        moment, precision, constant = self._profile(outputs, masks)
+        return list((0.5 * ((precision * moment).sum((-2, -1)) + constant)).unbind(-1))
+
+    def _profile_nlls(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Gaussian likelihoods at the residual covariances that are optimal for the batch; ``(*N, R)``."""
+        _, precision, constant = self._profile(outputs, masks)
+        nlls = {}
+        for i, skip in enumerate(self.skips):
+            residual = outputs[f"residual_{skip}"]
+            quadratic = (residual @ precision[..., i, :, :] * residual).sum(-1)
+            nlls[f"profile_{skip}"] = 0.5 * (quadratic + constant[..., i, None])
+        return nlls

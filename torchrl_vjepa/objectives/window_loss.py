@@ -9,10 +9,12 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_vjepa.objectives.pairs import mean_over
+from torchrl_vjepa.stacking import features_first
 from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
 
 __all__ = ["WindowLoss"]
@@ -30,7 +32,10 @@ class WindowLoss(LossModule):
     number for each model, and their sum gives every model exactly the gradient that it has alone; with
     Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
     are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
-    trained one back. This is how restarts and ensembles are trained.
+    trained one back. This is how restarts and ensembles are trained. A new loss over the best few trains
+    them on: many starts a little, few of them longer (successive halving), chosen by the objective. The
+    models share the coefficients of the loss, unless a coefficient's buffer has shape ``(num_models,)``:
+    one number for each model.
 
     Args:
         model: the model, or a list of models.
@@ -69,6 +74,8 @@ class WindowLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     _vmap_randomness = "same"
+    #: Whether the modules take the stacked parameters of several models: then nothing is mapped.
+    _stackable = False
     _model_type: type = torch.nn.Module
 
     def __init__(
@@ -107,8 +114,15 @@ class WindowLoss(LossModule):
             )
             if several and not stacked:
                 self._stack_one(name, parts[0], name in targets)
+        self._stackable = self._can_stack()
         self._set_in_keys()
         self._out_keys: list[NestedKey] | None = None
+
+    def _can_stack(self) -> bool:
+        """Whether every part of the model takes the stacked parameters of several models."""
+        parts = (getattr(self, name) for name in self._modules_of_model)
+        plain = (part.module if type(part) is TensorDictModule else part for part in parts)
+        return all(getattr(module, "stackable", False) for module in plain)
 
     def _stack_one(self, name: str, part: torch.nn.Module, has_target: bool) -> None:
         # Of a list of one TorchRL makes tensors that are no parameters: it takes them for shared ones.
@@ -183,6 +197,43 @@ class WindowLoss(LossModule):
     def out_keys(self, keys: list[NestedKey]) -> None:
         self._out_keys = keys
 
+    def select_out_keys(self, *out_keys: NestedKey) -> WindowLoss:
+        """Compute and return these entries only; diagnostics that nobody asks for cost nothing.
+
+        TorchRL's own takes a batch without the optional ``done`` for positional arguments and fails.
+
+        Args:
+            *out_keys: a subset of ``out_keys``.
+
+        Returns:
+            The loss itself.
+
+        Raises:
+            ValueError: if a key is not among ``out_keys``.
+        """
+        self._out_keys = None
+        unknown = [key for key in out_keys if key not in self.out_keys]
+        if unknown or not out_keys:
+            raise ValueError(f"out_keys must be some of {self.out_keys}, got {list(out_keys)}")
+        self._out_keys = list(out_keys)
+        return self
+
+    def reset_out_keys(self) -> WindowLoss:
+        """Return all entries again.
+
+        Returns:
+            The loss itself.
+        """
+        self._out_keys = None
+        return self
+
+    @property
+    def _wants_diagnostics(self) -> bool:
+        """Whether any is asked for: ``select_out_keys`` can leave out what a training step does not need."""
+        if self.reduction == "none":
+            return False
+        return self._out_keys is None or any(key in self._out_keys for key in self._diagnostic_keys())
+
     # What a member adds
 
     def _required_keys(self) -> list[NestedKey]:
@@ -203,10 +254,14 @@ class WindowLoss(LossModule):
         """The parameters that ``_terms`` takes, stacked if there are several models."""
         return tuple(getattr(self, f"{name}_params") for name in self._modules_of_model)
 
+    def _networks(self, data: TensorDictBase, *params: TensorDictBase) -> dict[str, Tensor]:
+        """What the modules make of windows ``(B, T)``: of one model, mapped over, or of all if stackable."""
+        raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
+
     def _terms(
-        self, data: TensorDictBase, masks: dict[str, Tensor], *params: TensorDictBase
+        self, data: TensorDictBase, masks: dict[str, Tensor], outputs: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """The ``loss_*`` entries and diagnostics of one model on windows ``(B, T)``."""
+        """The ``loss_*`` entries and diagnostics, from the outputs of all models at once."""
         raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
 
     # The computation
@@ -231,11 +286,13 @@ class WindowLoss(LossModule):
             raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
         model = models[index or 0]
         for name, attribute in self._modules_of_model.items():
-            params = getattr(self, f"{name}_params").data
+            params = getattr(self, f"{name}_params")
+            own = TensorDict.from_module(getattr(model, attribute))
             # Of a single model these are its own, unless the loss was copied or unpickled.
-            TensorDict.from_module(getattr(model, attribute)).data.update_(
-                params if index is None else params[index]
-            )
+            own.data.update_(params.data if index is None else params.data[index])
+            # The first model of a list lends the loss its modules: their parameters come back frozen.
+            for key, value in own.items(True, True):
+                value.requires_grad_(params.get(key).requires_grad)
         return model
 
     @dispatch
@@ -253,17 +310,19 @@ class WindowLoss(LossModule):
             KeyError: if an entry is missing.
             ValueError: if a window is too short, shapes disagree, or a value that counts is not finite.
         """
+        self._check_coeffs()
         data, masks = self._read(tensordict)
         params = self._params()
-        if self.num_models is None:
-            terms = self._terms(data, masks, *params)
+        if self.num_models is None or self._stackable:
+            outputs = self._networks(data, *params)
         else:
-            in_dim = 0 if self.stacked_data else None
-            terms = torch.vmap(
-                self._terms,
-                in_dims=(in_dim, in_dim, *[0] * len(params)),
+            # Only what depends on modules is mapped: the rest is arithmetic on larger tensors.
+            outputs = torch.vmap(
+                self._networks,
+                in_dims=(0 if self.stacked_data else None, *[0] * len(params)),
                 randomness=self._vmap_randomness,
-            )(data, masks, *params)
+            )(data, *params)
+        terms = self._terms(data, masks, outputs)
         terms = {key: terms[key] for key in self.out_keys}
         if self.reduction == "none":
             lead = () if self.num_models is None else (self.num_models,)
@@ -274,6 +333,18 @@ class WindowLoss(LossModule):
         out = TensorDict(terms, batch_size=[])
         self._clear_weakrefs(tensordict, out, *[f"{name}_params" for name in self._modules_of_model])
         return out
+
+    def _check_coeffs(self) -> None:
+        """A coefficient that is not shared has one entry for each model, and weighs scalars."""
+        own = (self.num_models,) if self.reduction != "none" else ()
+        for name in sorted(self._all_schedulable_buffers):
+            value = getattr(self, name)
+            if value is not None and value.ndim and value.shape != own:
+                raise ValueError(
+                    f"{name} must be a scalar or, for a list of models and reduction='mean' or 'sum', have "
+                    f"one entry for each model, got shape {tuple(value.shape)} for "
+                    f"num_models={self.num_models} and reduction={self.reduction!r}"
+                )
 
     def _watch(self, terms: dict[str, Tensor]) -> None:
         """Called with the terms of all models."""
@@ -351,36 +422,59 @@ class WindowLoss(LossModule):
 
     def _encode(self, data: TensorDictBase, params: TensorDictBase, latent_key: NestedKey) -> Tensor:
         """Latents ``(B, T, D)``, in float32 under autocast."""
-        with params.to_module(self.encoder):
-            latent = self.encoder(data.copy()).get(latent_key)
+        encoder = self.encoder
+        with params.to_module(encoder):
+            if type(encoder) is TensorDictModule and encoder.out_keys == [latent_key]:
+                # A plain network needs no tensordict.
+                inputs = [data.get(key) for key in encoder.in_keys]
+                if getattr(encoder.module, "row_wise", False):
+                    # A matrix, and not a stack of them, stays one product when models are mapped over.
+                    latent = encoder.module(inputs[0].flatten(-3, -2)).unflatten(-2, data.shape[-2:])
+                else:
+                    latent = encoder.module(*inputs)
+            else:
+                latent = encoder(data.copy()).get(latent_key)
         return latent.float() if latent.dtype in (torch.float16, torch.bfloat16) else latent
+
+    def _flat(self, windows: Tensor, steps: slice = slice(None)) -> Tensor:
+        """Windows ``(*N, B, T, D)``, or some of their steps, as rows ``(*N, B T, D)``."""
+        if self._stackable:
+            return features_first(windows, steps)
+        return windows[..., steps, :].flatten(-3, -2)
 
     def _reduce(self, values: list[Tensor], masks: list[Tensor | None], length: int) -> Tensor:
         """Reduce one number for each pair (or step), over pairs and skips, as ``reduction`` says.
 
         Args:
-            values: for each skip ``(B, T - skip)``.
-            masks: those that count, or ``None`` for all.
+            values: for each skip ``(*N, B, T - skip)``.
+            masks: those that count, ``(B, T - skip)`` or ``(*N, B, T - skip)``, or ``None`` for all.
             length: ``T``.
 
         Returns:
-            A scalar, or ``(B, T)`` for ``"none"``, zero where nothing counts. Several entries are
+            ``(*N)``, or ``(*N, B, T)`` for ``"none"``, zero where nothing counts. Several entries are
             averaged with ``skip_weights``.
         """
         rows = []
-        weights = self.skip_weights if len(values) == len(self.skips) else (1.0,)
         for value, mask in zip(values, masks, strict=True):
-            if mask is not None:
-                value = torch.where(mask, value, 0)
             if self.reduction == "none":
-                rows.append(torch.nn.functional.pad(value, (0, length - value.shape[1])))
-            elif self.reduction == "sum" or mask is None:
-                rows.append(value.sum() if self.reduction == "sum" else value.mean())
-            else:
-                rows.append(value.sum() / mask.sum().clamp_min(1))
-        return sum(
-            (weight * row for weight, row in zip(weights[1:], rows[1:], strict=True)), weights[0] * rows[0]
-        )
+                kept = value if mask is None else torch.where(mask, value, 0)
+                rows.append(torch.nn.functional.pad(kept, (0, length - value.shape[-1])))
+                continue
+            mask = None if mask is None else mask.flatten(-2)
+            mean = mean_over(value.flatten(-2), mask)
+            rows.append(mean * self._count(value, mask) if self.reduction == "sum" else mean)
+        return self._over_skips(rows)
+
+    @staticmethod
+    def _count(value: Tensor, mask: Tensor | None) -> Tensor | int:
+        return value.shape[-1] * value.shape[-2] if mask is None else mask.sum(-1)
+
+    def _over_skips(self, values: list[Tensor]) -> Tensor:
+        """Mean over skips with ``skip_weights``; a single entry stays as it is."""
+        if len(values) == 1:
+            return values[0]
+        first, *rest = (w * value for w, value in zip(self.skip_weights, values, strict=True))
+        return sum(rest, first)
 
 
 def _normalised(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
