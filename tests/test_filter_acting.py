@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Independent, LogNormal
 from torchrl.collectors import Collector
 from torchrl.data import Bounded
 from torchrl.envs import (
@@ -341,6 +341,24 @@ def test_cost_of_a_belief_is_the_mean_over_its_particles() -> None:
     torch.testing.assert_close(env.objective(state, plans), expected)
     worst = world(num_samples=4, risk=lambda costs: costs.amax(0))
     torch.testing.assert_close(worst.objective(state, plans), torch.tensor([9.0, 6.25, 16.0]))
+
+
+def test_what_follows_a_particle_is_the_point_that_was_asked_for() -> None:
+    def skewed(latent: Tensor, action: Tensor) -> Distribution:
+        return Independent(LogNormal(latent + action, torch.ones_like(latent)), 1)
+
+    state = TensorDict(particles=torch.tensor([[0.0]]), log_weights=torch.zeros(1))
+    for how, expected in (("mean", 1.0), ("mode", -2.0)):  # squared: exp(2 mean), exp(2 mode)
+        env = LatentEnv(
+            skewed,
+            action_spec=Bounded(-1, 1, (1,)),
+            cost=lambda z, u: z.squeeze(-1).square(),
+            latent_dim=1,
+            how=how,
+            belief_key="belief",
+        )
+        cost = env.objective(state, torch.zeros(1, 1, 1))
+        torch.testing.assert_close(cost, torch.tensor([expected]).exp())
 
 
 def test_candidates_and_rows_share_their_particles() -> None:

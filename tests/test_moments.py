@@ -321,7 +321,8 @@ def test_no_gap_in_a_compositional_model(divergence: Any, method: Any, step: int
 def test_the_gap_measures_the_disagreement() -> None:
     predictor = compositional((1, 4))
     latent, actions = torch.randn(5, D).double(), torch.randn(5, 4, A).double()
-    before = predictor.dist(latent, actions, skip=4)
+    p = predictor.dist(latent, actions, skip=4)
+    before = diag_gaussian(p.mean.detach().clone(), p.stddev.detach().clone())
     with torch.no_grad():
         predictor.trunks[1].weight[:, 0] += 0.1
         predictor.constants[1] += math.log(4.0)  # twice the standard deviation
