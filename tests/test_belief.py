@@ -176,3 +176,34 @@ def test_the_input_is_not_changed() -> None:
     rollout(lambda z, u: Delta(z + u), latent, actions)
     assert torch.equal(latent, copies[0])
     assert torch.equal(actions, copies[1])
+
+
+@pytest.mark.parametrize(("chunk_size", "sizes"), [(3, [3, 3, 1]), (7, [7]), (50, [7])])
+def test_chunks_bound_what_the_transition_sees(
+    system: LinearGaussian, chunk_size: int, sizes: list[int]
+) -> None:
+    latent, actions = _problem(2)
+    generator = torch.Generator().manual_seed(0)
+    out = rollout(system, latent, actions, "sample", 7, chunk_size=chunk_size, generator=generator)
+    assert out.shape == (7, 2, H, D)
+    assert [latent[0] for latent, _ in system.calls] == [size for size in sizes for _ in range(H)]
+    assert len(torch.unique(out[:, 0, 0, 0])) == 7
+    if len(sizes) == 1:
+        generator.manual_seed(0)
+        assert torch.equal(out, rollout(system, latent, actions, "sample", 7, generator=generator))
+
+
+def test_chunks_have_the_moments_of_the_whole(system: LinearGaussian) -> None:
+    draws = 20_000
+    latent, actions = _problem()
+    out = rollout(system, latent, actions, "sample", draws, chunk_size=999)
+    mean, covariance = system.moments(latent, actions)
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    assert ((out.mean(0) - mean).abs() < 5 * (variance / draws).sqrt()).all()
+    torch.testing.assert_close(out.var(0), variance, rtol=0.06, atol=0)
+
+
+@pytest.mark.parametrize(("how", "chunk_size"), [("mean", 2), ("sample", 0)])
+def test_the_chunk_size_is_checked(how: str, chunk_size: int) -> None:
+    with pytest.raises(ValueError, match=f"chunk_size must be positive.*got {chunk_size} with how='{how}'"):
+        rollout(_never, torch.zeros(3), torch.zeros(6, 2), how, chunk_size=chunk_size)

@@ -158,6 +158,22 @@ def check_table_report(report: dict[str, Any]) -> None:
             assert row[key] is None or row[key] <= 1.0
 
 
+def check_surprise_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``surprise.py``: one row for each detector, change and seed, in range."""
+    assert set(report) == {"settings", "wall_s", "rows"}
+    rows = report["rows"]
+    cells = {(row["detector"], row["change"], row["seed"]) for row in rows}
+    assert len(cells) == len(rows) == 2 * 7 * len(report["settings"]["seeds"])
+    for row in rows:
+        assert 0 <= row["alarms_before"] <= 1
+        assert 0 <= row["alarms_after"] <= 1
+        assert (row["median_delay"] is None) == (row["alarms_after"] == 0)
+        if row["detector"] == "vjepa" and row["change"] in ("nothing", "switched on"):
+            assert row["alarms_after"] <= 0.1
+        if row["change"] == "pixel":
+            assert row["surprise_after"] > row["surprise_before"]
+
+
 def check_cliff_report(report: dict[str, Any]) -> None:
     """Checks the report of ``cliff.py``: its keys, its ranges, and one row for each planner and model."""
     assert set(report) == {"settings", "wall_s", "rows"}
@@ -182,6 +198,7 @@ def check_cliff_report(report: dict[str, Any]) -> None:
 CHECKS = {
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,
+    "surprise": check_surprise_report,
     "cliff": check_cliff_report,
 }
 

@@ -21,6 +21,7 @@ PACKAGE = ROOT / "torchrl_vjepa"
 # Files and folders directly under the package; a folder's leaves share its layer.
 LAYERS = {
     "distributions": 0,
+    "generators": 0,
     "stacking": 0,
     "noisy_tv": 0,
     "statistics": 0,

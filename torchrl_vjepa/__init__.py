@@ -1,7 +1,18 @@
 """Probabilistic joint-embedding world models, their losses, environments and planners, for TorchRL."""
 
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
-from torchrl_vjepa.belief import rollout
+from torchrl_vjepa.belief import (
+    LinearObservation,
+    ParticleBelief,
+    ParticleFilter,
+    PseudoLikelihood,
+    composition_gap,
+    effective_sample_size,
+    propagate_moments,
+    rollout,
+    surprise,
+    systematic_resampling,
+)
 from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
 from torchrl_vjepa.distributions import (
@@ -91,6 +102,7 @@ __all__ = [
     "LatentModel",
     "LatentPredictionLoss",
     "LinearGaussianSystem",
+    "LinearObservation",
     "LinearProbe",
     "LowRankGaussian",
     "LowRankGaussianHead",
@@ -98,12 +110,15 @@ __all__ = [
     "Mixture",
     "MixtureHead",
     "NoisyTVEnv",
+    "ParticleBelief",
+    "ParticleFilter",
     "PixelAR",
     "PixelARLoss",
     "PixelDecoder",
     "Planner",
     "Predictor",
     "Proposal",
+    "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",
     "RewardLoss",
@@ -116,9 +131,11 @@ __all__ = [
     "Whitening",
     "WindowLoss",
     "action_cost",
+    "composition_gap",
     "cvar",
     "diag_gaussian",
     "effective_rank",
+    "effective_sample_size",
     "entropic",
     "entropy_bounds",
     "expectation",
@@ -137,10 +154,13 @@ __all__ = [
     "mutual_information_bound",
     "point_estimate",
     "product_of_experts",
+    "propagate_moments",
     "quadratic_cost",
     "rollout",
     "sample",
     "select_best",
     "sliced_gaussian_distance",
+    "surprise",
+    "systematic_resampling",
     "worst_case",
 ]

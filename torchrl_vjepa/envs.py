@@ -12,15 +12,16 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
-from torchrl_vjepa.belief import rollout
+from torchrl_vjepa.belief import rollout, systematic_resampling
 from torchrl_vjepa.common_random_numbers import CommonNoise
 from torchrl_vjepa.costs import StageCost
+from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.latent_step import LatentStep
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, plan_cost
 
@@ -51,7 +52,8 @@ class LatentEnv(ModelBasedEnvBase):
             ``(*B, 1)``. Either this or ``cost``.
         cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; the reward is minus the cost.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
-        num_samples: trajectories ``M`` per candidate plan for ``how="sample"``. They share their
+        num_samples: trajectories ``M`` per candidate plan for ``how="sample"``, or from ``M`` particles
+            of a belief with any ``how``. They share their
             random numbers across candidates and across the batch (common random numbers: the ranking
             of plans does not depend on luck), as far as
             :func:`~torchrl_vjepa.common_random_numbers.sample_common` knows the distribution.
@@ -60,6 +62,9 @@ class LatentEnv(ModelBasedEnvBase):
         constraints: chance constraints on the ``M`` trajectories.
         latent_dim: size ``D``; needed only if the model does not tell.
         latent_key: where the latent is; by default the model's, else ``"latent"``.
+        belief_key: where a belief is, ``("next", "belief")`` behind a
+            :class:`~torchrl_vjepa.belief.ParticleFilter`: planning then starts from ``num_samples`` of
+            its particles, the same for all candidates, instead of from the latent.
         action_key: where the action is; by default the model's, else ``"action"``.
         reward_key: where the reward is written.
         device: by default the one of the model's parameters.
@@ -104,6 +109,7 @@ class LatentEnv(ModelBasedEnvBase):
         constraints: Sequence[ChanceConstraint] = (),
         latent_dim: int | None = None,
         latent_key: NestedKey | None = None,
+        belief_key: NestedKey | None = None,
         action_key: NestedKey | None = None,
         reward_key: NestedKey = "reward",
         device: torch.device | str | None = None,
@@ -116,12 +122,13 @@ class LatentEnv(ModelBasedEnvBase):
             )
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
-        if num_samples < 1 or (num_samples > 1 and how != "sample"):
+        sampled = how == "sample" or belief_key is not None
+        if num_samples < 1 or (num_samples > 1 and not sampled):
             raise ValueError(
                 "num_samples must be at least 1, and 1 unless how='sample', "
-                f"got {num_samples} with how={how!r}"
+                f"got {num_samples} with how={how!r} and no belief_key"
             )
-        Sampling.checked(num_samples if how == "sample" else None, risk, constraints)
+        Sampling.checked(num_samples if sampled else None, risk, constraints)
         predictor = getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
         if not callable(transition):
@@ -157,6 +164,10 @@ class LatentEnv(ModelBasedEnvBase):
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
         self.latent_dim, self.action_dim = latent_dim, action_dim
         self.latent_key = unravel_key(latent_key)
+        self.planning_keys = [self.latent_key]
+        self.belief_key = None if belief_key is None else unravel_key(belief_key)
+        if belief_key is not None:
+            self.planning_keys = [unravel_key((belief_key, name)) for name in ("particles", "log_weights")]
         self.how, self.num_samples, self.risk = how, num_samples, risk
         self.constraints: Any = nn.ModuleList(constraints)  # registered: their modules move along
         self.rng: torch.Generator | None = None
@@ -172,30 +183,39 @@ class LatentEnv(ModelBasedEnvBase):
         )
         world_model.probe(latent_dim, action_dim, self.device, dtype)
 
-    def planning_state(self, tensordict: TensorDictBase) -> Tensor:
-        """Where imagination starts: the latent, and nothing else of the input.
+    def planning_state(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
+        """Where imagination starts: the latent or the belief, and nothing else of the input.
 
         Args:
-            tensordict: holds the latent.
+            tensordict: holds the latent, or the belief if there is a ``belief_key``.
 
         Returns:
-            Latent of shape ``(*B, D)``.
+            Latent of shape ``(*B, D)``; or a tensordict of batch size ``*B`` with ``particles
+            (K, D)`` and ``log_weights (K)``.
 
         Raises:
-            KeyError: if there is no latent.
+            KeyError: if an entry is missing.
             ValueError: if its last dimension is not ``D``.
         """
-        latent = tensordict.get(self.latent_key, None)
-        if latent is None:
-            raise KeyError(
-                f"planning needs the entry {self.latent_key!r}, got a tensordict with "
-                f"{sorted(map(str, tensordict.keys(True, True)))}; put the encoder in front"
-            )
-        if latent.shape[-1:] != (self.latent_dim,):
+        values = [tensordict.get(key, None) for key in self.planning_keys]
+        for key, value in zip(self.planning_keys, values, strict=True):
+            if value is None:
+                raise KeyError(
+                    f"planning needs the entry {key!r}, got a tensordict with "
+                    f"{sorted(map(str, tensordict.keys(True, True)))}; put the "
+                    f"{'encoder' if self.belief_key is None else 'particle filter'} in front"
+                )
+        start = values[0]
+        if start.shape[-1:] != (self.latent_dim,):
+            lead = "(*B" if self.belief_key is None else "(*B, K"
             raise ValueError(
-                f"{self.latent_key!r} must have shape (*B, {self.latent_dim}), got {tuple(latent.shape)}"
+                f"{self.planning_keys[0]!r} must have shape {lead}, {self.latent_dim}), "
+                f"got {tuple(start.shape)}"
             )
-        return latent
+        if self.belief_key is None:
+            return start
+        names = ("particles", "log_weights")
+        return TensorDict(dict(zip(names, values, strict=True)), batch_size=start.shape[:-2])
 
     def sampling(
         self,
@@ -217,7 +237,8 @@ class LatentEnv(ModelBasedEnvBase):
             ValueError: if ``num_samples`` is not positive, or a risk or constraint has no samples to read.
             TypeError: if ``risk`` is not callable or ``constraints`` holds something else.
         """
-        own = self.num_samples if self.how == "sample" else None
+        sampled = self.how == "sample" or self.belief_key is not None
+        own = self.num_samples if sampled else None
         return Sampling.checked(
             own if num_samples is None else num_samples,
             self.risk if risk is None else risk,
@@ -226,7 +247,7 @@ class LatentEnv(ModelBasedEnvBase):
 
     def objective(
         self,
-        state: Tensor,
+        state: Tensor | TensorDictBase,
         actions: Tensor,
         *,
         generator: torch.Generator | None = None,
@@ -239,7 +260,7 @@ class LatentEnv(ModelBasedEnvBase):
         Gradients flow to ``actions`` if they require them.
 
         Args:
-            state: latents to start from, of shape ``(*B, D)``.
+            state: what :meth:`planning_state` gives: latents of shape ``(*B, D)``, or a belief.
             actions: candidate plans, of shape ``(*B, N, H, A)``.
             generator: source of randomness for sampled trajectories.
             num_samples: trajectories per plan; ``None``: as the environment does.
@@ -259,7 +280,7 @@ class LatentEnv(ModelBasedEnvBase):
 
     def violation_probability(
         self,
-        state: Tensor,
+        state: Tensor | TensorDictBase,
         actions: Tensor,
         *,
         generator: torch.Generator | None = None,
@@ -269,7 +290,7 @@ class LatentEnv(ModelBasedEnvBase):
         """How often candidate plans violate each constraint, among their sampled trajectories.
 
         Args:
-            state: latents to start from, of shape ``(*B, D)``.
+            state: what :meth:`planning_state` gives: latents of shape ``(*B, D)``, or a belief.
             actions: candidate plans, of shape ``(*B, N, H, A)``.
             generator: source of randomness.
             num_samples: trajectories per plan; ``None``: as the environment does.
@@ -289,25 +310,30 @@ class LatentEnv(ModelBasedEnvBase):
 
     def _imagine(
         self,
-        state: Tensor,
+        state: Tensor | TensorDictBase,
         actions: Tensor,
         num_samples: int | None,
         generator: torch.Generator | None,
     ) -> tuple[Tensor, Tensor]:
         """Latents and actions, ``(*B, N, H, ...)``, or ``(M, *B, N, H, ...)`` where they are sampled."""
         batch, (num_candidates, _, action_dim) = actions.shape[:-3], actions.shape[-3:]
-        if state.shape != (*batch, self.latent_dim) or action_dim != self.action_dim:
+        drawn = not isinstance(state, Tensor)
+        start = _drawn(state, num_samples or 1, generator) if drawn else state
+        if start.shape[drawn:] != (*batch, self.latent_dim) or action_dim != self.action_dim:
             raise ValueError(
                 f"state and actions must have shapes (*B, {self.latent_dim}) and (*B, N, H, "
-                f"{self.action_dim}), got {tuple(state.shape)} and {tuple(actions.shape)}"
+                f"{self.action_dim}), got {tuple(start.shape[drawn:])} and {tuple(actions.shape)}"
             )
-        actions = actions.to(state.dtype)
-        start = state.unsqueeze(-2).expand(*batch, num_candidates, self.latent_dim)
+        actions = actions.to(start.dtype)
         transition = self.world_model.transition
+        if not drawn and num_samples is not None:
+            start = start.expand(num_samples, *start.shape)
+        start = start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim)
         if num_samples is None:
             return rollout(transition, start, actions, self.how), actions
-        start = start.expand(num_samples, *start.shape)
         actions = actions.expand(num_samples, *actions.shape)
+        if drawn and self.how != "sample":  # the belief is sampled, what follows is not
+            return rollout(transition, start, actions, self.how), actions
         return rollout(CommonNoise(transition, generator), start, actions, "mean"), actions
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
@@ -357,34 +383,13 @@ class LatentEnv(ModelBasedEnvBase):
         super().__setstate__({**state, "rng": None if rng is None else unpack_generator(rng)})
 
 
-def pack_generator(generator: torch.Generator) -> tuple[str, bytes]:
-    """Device and state of a generator, in a form that survives every way of pickling.
-
-    ``torch.Generator`` pickles its state as a temporary tensor, whose file descriptor is closed too
-    early when a process is spawned.
-
-    Args:
-        generator: the generator.
-
-    Returns:
-        Name of its device, and its state.
-    """
-    return str(generator.device), generator.get_state().numpy().tobytes()
-
-
-def unpack_generator(packed: tuple[str, bytes]) -> torch.Generator:
-    """The inverse of :func:`pack_generator`.
-
-    Args:
-        packed: device and state.
-
-    Returns:
-        A generator that continues where the packed one was.
-    """
-    device, state = packed
-    generator = torch.Generator(device)
-    generator.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
-    return generator
+def _drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:
+    """Particles ``(M, *B, D)`` of a belief, by one random number for all rows, as all planning noise."""
+    index = systematic_resampling(
+        belief.get("log_weights"), num_samples, shared=True, generator=generator
+    ).unsqueeze(-1)
+    particles = belief.get("particles")
+    return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
 
 
 def _first(*values: Any) -> Any:

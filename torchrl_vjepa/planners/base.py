@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import MPCPlannerBase
 
-from torchrl_vjepa.envs import pack_generator, unpack_generator
+from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
 from torchrl_vjepa.planners.proposal import Proposal, continuous_action, gaussian_of_bounds
 from torchrl_vjepa.risk import REJECTED_COST, ChanceConstraint, Risk
@@ -214,7 +214,7 @@ class Planner(MPCPlannerBase):
         for name, tensor in (("low", low), ("high", high), ("centre", centre), ("cold_std", std)):
             self.register_buffer(name, tensor.flatten(), persistent=False)
         own = self._env_objective
-        reads = [env.latent_key] if own is None else list(own.in_keys)
+        reads = list(env.planning_keys if own is None else own.in_keys)
         writes = [written]
         if warm_start:
             reads += [self.plan_key, self.init_key]

@@ -1,4 +1,4 @@
-"""Beliefs over future latents: the predictive distribution, iterated."""
+"""The predictive distribution, iterated: latent trajectories."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from torchrl_vjepa.distributions import point_estimate
 
-__all__ = ["Transition", "rollout"]
+__all__ = ["Transition", "check_plan", "rollout"]
 
 Transition = Callable[[Tensor, Tensor], Distribution]
 
@@ -23,6 +23,7 @@ def rollout(
     how: Literal["mean", "mode", "sample"] = "mean",
     num_samples: int = 1,
     *,
+    chunk_size: int | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     r"""Latent trajectories under a plan (``eq:VJEPA_multi_step_prediction``).
@@ -37,6 +38,9 @@ def rollout(
         actions: the plan, of shape ``(*B, H, A)``.
         how: point prediction or Monte Carlo.
         num_samples: number of trajectories :math:`M` for ``"sample"``.
+        chunk_size: how many of the ``M`` trajectories are rolled out at a time, for ``"sample"``; all
+            by default. What the transition computes on the way then takes memory for ``chunk_size``
+            trajectories, whatever ``M`` is. The draws are others, of the same distribution.
         generator: source of randomness for ``"sample"``.
 
     Returns:
@@ -44,8 +48,9 @@ def rollout(
         ``"sample"``.
 
     Raises:
-        ValueError: if shapes disagree, the plan is empty, ``how`` is unknown, ``num_samples`` is not
-            positive, or a point prediction is asked for with ``num_samples > 1``.
+        ValueError: if shapes disagree, the plan is empty, ``how`` is unknown, ``num_samples`` or
+            ``chunk_size`` is not positive, or a point prediction is asked for with ``num_samples > 1``
+            or a ``chunk_size``.
 
     Examples:
         >>> import torch
@@ -61,18 +66,63 @@ def rollout(
     """
     if how not in ("mean", "mode", "sample"):
         raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
+    check_plan(latent, actions)
+    if num_samples < 1 or (how != "sample" and num_samples != 1):
+        raise ValueError(
+            f"num_samples must be positive, and 1 unless how='sample', got {num_samples} with how={how!r}"
+        )
+    if chunk_size is not None and (chunk_size < 1 or how != "sample"):
+        raise ValueError(
+            f"chunk_size must be positive, and None unless how='sample', got {chunk_size} with how={how!r}"
+        )
+    if how != "sample":
+        return _roll(transition, latent, actions, how, None)
+    size = num_samples if chunk_size is None else chunk_size
+    out: Tensor | None = None
+    for first in range(0, num_samples, size):
+        num = min(size, num_samples - first)
+        part = _roll(
+            transition,
+            latent.expand(num, *latent.shape),
+            actions.expand(num, *actions.shape),
+            how,
+            generator,
+        )
+        if num == num_samples:
+            return part
+        if out is None:  # written in place: a concatenation would hold everything twice
+            out = part.new_empty((num_samples, *part.shape[1:]))
+        out[first : first + num] = part
+    return torch.as_tensor(out)
+
+
+def check_plan(latent: Tensor, actions: Tensor) -> None:
+    """Refuse a plan that does not fit the latents.
+
+    Args:
+        latent: where it starts, ``(*B, D)``.
+        actions: the plan, ``(*B, H, A)``.
+
+    Raises:
+        ValueError: if batch dimensions disagree or the plan is empty.
+
+    Examples:
+        >>> check_plan(torch.zeros(5, 3), torch.zeros(5, 10, 2))
+    """
     if actions.ndim != latent.ndim + 1 or actions.shape[:-2] != latent.shape[:-1] or not actions.shape[-2]:
         raise ValueError(
             "actions must have shape (*B, H, A) with H of at least 1 and the batch dimensions of latent "
             f"{tuple(latent.shape)}, got {tuple(actions.shape)}"
         )
-    if num_samples < 1 or (how != "sample" and num_samples != 1):
-        raise ValueError(
-            f"num_samples must be positive, and 1 unless how='sample', got {num_samples} with how={how!r}"
-        )
-    if how == "sample":
-        latent = latent.expand(num_samples, *latent.shape)
-        actions = actions.expand(num_samples, *actions.shape)
+
+
+def _roll(
+    transition: Transition,
+    latent: Tensor,
+    actions: Tensor,
+    how: Literal["mean", "mode", "sample"],
+    generator: torch.Generator | None,
+) -> Tensor:
     latents = []
     for action in actions.unbind(-2):
         latent = point_estimate(transition(latent, action), how, generator=generator)
