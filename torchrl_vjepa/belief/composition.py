@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from torchrl_vjepa.belief.moments import moments_of, propagate_moments
+from torchrl_vjepa.belief.moments import propagate_moments
 from torchrl_vjepa.belief.rollouts import check_plan
+from torchrl_vjepa.distributions import moments
 
 __all__ = ["composition_gap"]
 
@@ -78,7 +79,7 @@ def composition_gap(
     chunks = actions.reshape(*actions.shape[:-2], skip // step, step * action_dim)
     means, covariances = propagate_moments(iterated, latent, chunks, method)
     arrival = means[..., -1, :], covariances[..., -1, :, :]
-    direct = moments_of(dist(latent, actions, skip=skip))
+    direct = moments(dist(latent, actions, skip=skip))
     return (_wasserstein if divergence == "wasserstein" else _kl)(*arrival, *direct)
 
 

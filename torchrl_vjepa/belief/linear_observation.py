@@ -8,8 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, MultivariateNormal
 
-from torchrl_vjepa.belief.moments import moments_of
-
 __all__ = ["LinearObservation"]
 
 
@@ -93,7 +91,7 @@ class LinearObservation(nn.Module):
         Raises:
             TypeError: if ``p`` has no moments in closed form.
         """
-        mean, covariance = moments_of(p)
+        mean, covariance = moments(p)
         factor = torch.linalg.cholesky(covariance)
         prior = torch.cholesky_inverse(factor)
         weighted = self.matrix / self.std.square().unsqueeze(-1)

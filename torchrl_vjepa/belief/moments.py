@@ -9,15 +9,12 @@ from torch import Tensor
 from torch.distributions import (
     Distribution,
     Independent,
-    LowRankMultivariateNormal,
-    MixtureSameFamily,
-    MultivariateNormal,
 )
 
 from torchrl_vjepa.belief.rollouts import Transition, check_plan
-from torchrl_vjepa.distributions import Delta
+from torchrl_vjepa.distributions import Delta, moments
 
-__all__ = ["moments_of", "propagate_moments"]
+__all__ = ["propagate_moments"]
 
 
 def propagate_moments(
@@ -51,8 +48,7 @@ def propagate_moments(
 
     Args:
         transition: ``(latent (*B, D), action (*B, A)) -> Distribution``, for instance ``Predictor.dist``,
-            with moments in closed form: Gaussian (diagonal, full, low-rank), point mass, mixture of
-            those, or independent dimensions.
+            whose moments :func:`~torchrl_vjepa.distributions.moments` gives.
         latent: the mean to start from, of shape ``(*B, D)``.
         actions: the plan, of shape ``(*B, H, A)``.
         method: how the integral over the belief is taken.
@@ -85,47 +81,12 @@ def propagate_moments(
     mean, means, covariances = latent, [], []
     for action in actions.unbind(-2):
         if covariance is None:
-            mean, covariance = moments_of(transition(mean, action))
+            mean, covariance = moments(transition(mean, action))
         else:
             mean, covariance = step(transition, mean, covariance, action)
         means.append(mean)
         covariances.append(covariance)
     return torch.stack(means, dim=-2), torch.stack(covariances, dim=-3)
-
-
-def moments_of(p: Distribution) -> tuple[Tensor, Tensor]:
-    """Mean and covariance, in closed form.
-
-    Args:
-        p: batch ``*B``, event ``(D,)``.
-
-    Returns:
-        ``(*B, D)`` and ``(*B, D, D)``.
-
-    Raises:
-        TypeError: if the distribution has none in closed form.
-
-    Examples:
-        >>> moments_of(Delta(torch.ones(2)))[1]
-        tensor([[0., 0.],
-                [0., 0.]])
-    """
-    variance = _diagonal(p)
-    if variance is not None:
-        return p.mean, torch.diag_embed(variance)
-    if isinstance(p, (MultivariateNormal, LowRankMultivariateNormal)):
-        return p.mean, p.covariance_matrix
-    if isinstance(p, MixtureSameFamily):
-        means, covariances = moments_of(p.component_distribution)
-        weights = p.mixture_distribution.probs.unsqueeze(-1)
-        mean = (weights * means).sum(-2)
-        offset = means - mean.unsqueeze(-2)
-        within = (weights.unsqueeze(-1) * covariances).sum(-3)
-        return mean, within + (weights * offset).mT @ offset
-    raise TypeError(
-        "transition must return a distribution with moments in closed form, got "
-        f"{type(p).__name__}; rollout(..., how='sample') gives the moments of any distribution"
-    )
 
 
 def _diagonal(p: Distribution) -> Tensor | None:
@@ -141,7 +102,7 @@ def _linearized(
     transition: Transition, mean: Tensor, covariance: Tensor, action: Tensor
 ) -> tuple[Tensor, Tensor]:
     def predict(latent: Tensor) -> tuple[Tensor, Tensor]:
-        return moments_of(transition(latent, action))
+        return moments(transition(latent, action))
 
     dim = mean.shape[-1]
     following, pullback, noise = torch.func.vjp(predict, mean, has_aux=True)  # type: ignore[misc]
@@ -162,7 +123,7 @@ def _cubature(
     p = transition(points, action.expand(2 * dim, *action.shape))
     variance = _diagonal(p)
     if variance is None:
-        means, covariances = moments_of(p)
+        means, covariances = moments(p)
         noise = covariances.mean(0)
     else:  # not embedded in 2 D matrices first
         means, noise = p.mean, torch.diag_embed(variance.mean(0))
