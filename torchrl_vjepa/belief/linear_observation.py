@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, MultivariateNormal
 
+from torchrl_vjepa.distributions import moments
+
 __all__ = ["LinearObservation"]
 
 
@@ -89,7 +91,6 @@ class LinearObservation(nn.Module):
             Gaussian with batch ``(*B, K)`` and event ``(D,)``.
 
         Raises:
-            TypeError: if ``p`` has no moments in closed form.
         """
         mean, covariance = moments(p)
         factor = torch.linalg.cholesky(covariance)
