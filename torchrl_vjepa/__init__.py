@@ -3,7 +3,25 @@
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import rollout
 from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
-from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
+from torchrl_vjepa.diagnostics import (
+    Calibration,
+    CredibleInterval,
+    Histogram,
+    LinearProbe,
+    ReliabilityCurve,
+    calibration_by_horizon,
+    calibration_by_skip,
+    coverage,
+    credible_interval,
+    crps,
+    energy_score,
+    linear_probe,
+    mutual_information_bound,
+    pit_histogram,
+    probability_integral_transform,
+    recalibrate,
+    reliability_curve,
+)
 from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
@@ -29,6 +47,7 @@ from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, R
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
+from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
@@ -36,8 +55,10 @@ __all__ = [
     "BJEPALoss",
     "BatchedNoisyTVEnv",
     "CEM",
+    "Calibration",
     "CollapseWarning",
     "Cost",
+    "CredibleInterval",
     "Delta",
     "DeltaHead",
     "DiagGaussianHead",
@@ -45,6 +66,7 @@ __all__ = [
     "FusedPredictor",
     "GaussianPrior",
     "Head",
+    "Histogram",
     "JEPA",
     "JEPALoss",
     "KalmanFilter",
@@ -64,6 +86,7 @@ __all__ = [
     "Proposal",
     "QuadraticReward",
     "RandomShooting",
+    "ReliabilityCurve",
     "RewardLoss",
     "TargetScale",
     "VAE",
@@ -73,8 +96,14 @@ __all__ = [
     "Whitening",
     "WindowLoss",
     "action_cost",
+    "calibration_by_horizon",
+    "calibration_by_skip",
+    "coverage",
+    "credible_interval",
+    "crps",
     "diag_gaussian",
     "effective_rank",
+    "energy_score",
     "expectation",
     "gaussian_entropy",
     "history_encoder",
@@ -82,10 +111,15 @@ __all__ = [
     "linear_probe",
     "mlp_encoder",
     "mutual_information_bound",
+    "pit_histogram",
     "point_estimate",
+    "probability_integral_transform",
     "product_of_experts",
     "quadratic_cost",
+    "recalibrate",
+    "reliability_curve",
     "rollout",
     "sample",
     "sliced_gaussian_distance",
+    "temper",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +15,7 @@ from torchrl.modules import MLP
 
 from torchrl_vjepa.distributions import point_estimate, product_of_experts
 from torchrl_vjepa.heads import DiagGaussianHead, Head
+from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.windows import read
 
 __all__ = ["FusedPredictor", "Predictor"]
@@ -107,6 +108,12 @@ class Predictor(_Transition):
         side_info_key: where the side information is read.
         out_key: where the prediction is written.
 
+    Attributes:
+        temperature: what every skip's deviations from its mean are multiplied with
+            (:func:`~torchrl_vjepa.temperature.temper`), of shape ``(len(skips),)``: a buffer, set by
+            :meth:`set_temperature` or :func:`~torchrl_vjepa.diagnostics.recalibrate`. ``None``, with
+            nothing computed and nothing in the state dict, is 1.
+
     Raises:
         ValueError: if a size, a skip, ``trunk`` or ``how`` is not valid.
 
@@ -118,6 +125,8 @@ class Predictor(_Transition):
         >>> predictor.dist(torch.zeros(7, 4), torch.zeros(7, 3, 2), skip=3).variance.shape
         torch.Size([7, 4])
     """
+
+    temperature: Tensor | None
 
     def __init__(
         self,
@@ -181,6 +190,7 @@ class Predictor(_Transition):
                 ]
             )
         self.constants = nn.Parameter(torch.zeros(len(skips), self.head.num_constants(latent_dim)))
+        self.register_buffer("temperature", None)
         self.latent_key, self.action_key, self.side_info_key = latent_key, action_key, side_info_key
         self.in_keys = [latent_key]
         if action_dim:
@@ -190,9 +200,11 @@ class Predictor(_Transition):
         self.out_keys = [out_key]
 
     def reset_parameters(self) -> None:
-        """Set the constants of the head back to zero (the trunks reset themselves)."""
+        """Set the constants of the head back to zero and the temperatures to 1 (trunks reset themselves)."""
         with torch.no_grad():
             self.constants.zero_()
+            if self.temperature is not None:
+                self.temperature.fill_(1.0)
 
     def _reset_parameters(self, module: nn.Module) -> bool:
         # reset_parameters_recursive visits the children only, not the module that it is called on.
@@ -200,6 +212,37 @@ class Predictor(_Transition):
         if module is self:
             self.reset_parameters()
         return any_reset
+
+    def set_temperature(self, temperature: Tensor | Sequence[float] | None) -> None:
+        """Widen or narrow the predictive distribution of every skip around its mean.
+
+        Args:
+            temperature: one positive number for each of ``skips``, in their order; ``None`` for 1, as
+                the head says.
+
+        Raises:
+            ValueError: if it has another shape or is not positive and finite.
+        """
+        if temperature is None:
+            self.temperature = None
+            return
+        value = torch.as_tensor(temperature).detach().to(self.constants).clone()
+        if value.shape != (len(self.skips),):
+            raise ValueError(
+                f"temperature must have shape ({len(self.skips)},), one number for each of "
+                f"skips={self.skips}, got {tuple(value.shape)}"
+            )
+        if not bool((value.isfinite() & (value > 0)).all()):
+            raise ValueError(f"temperature must be positive and finite, got {value.tolist()}")
+        self.temperature = value
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # A buffer that is None is not in the state dict, so whether there is one is part of the state.
+        if prefix + "temperature" not in state_dict:
+            self.temperature = None
+        elif self.temperature is None:
+            self.temperature = self.constants.new_ones(len(self.skips))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def dist(
         self,
@@ -254,7 +297,8 @@ class Predictor(_Transition):
                 [features[..., : self.latent_dim] + latent, features[..., self.latent_dim :]],
                 dim=-1,
             )
-        return self.head(features, self.constants[index])
+        p = self.head(features, self.constants[index])
+        return p if self.temperature is None else temper(p, self.temperature[index])
 
     def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
         batch = latent.shape[:-1]
