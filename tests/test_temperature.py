@@ -24,14 +24,20 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_vjepa import (
     VJEPA,
+    CouplingFlow,
     Delta,
     DeltaHead,
     DiagGaussianHead,
+    Ensemble,
+    FlowHead,
     FusedPredictor,
     GaussianPrior,
+    LowRankGaussian,
+    Mixture,
     Predictor,
     VJEPALoss,
     diag_gaussian,
+    full_gaussian,
     linear_encoder,
     temper,
 )
@@ -49,16 +55,33 @@ def _full() -> Distribution:
 
 
 def _low_rank() -> Distribution:
-    factor, diagonal = torch.randn(B, D, 2).double(), torch.rand(B, D).double() + 0.5
-    return LowRankMultivariateNormal(torch.randn(B, D).double(), factor, diagonal)
+    factor, scale = torch.randn(B, D, 2).double(), torch.rand(B, D).double() + 0.5
+    return LowRankGaussian(torch.randn(B, D).double(), factor, scale)
 
 
 def _mixture() -> Distribution:
     components = diag_gaussian(2 * torch.randn(B, 4, D).double(), torch.rand(B, 4, D).double() + 0.2)
-    return MixtureSameFamily(Categorical(torch.rand(B, 4).double()), components)
+    return Mixture(torch.randn(B, 4).double(), components)
 
 
-def _full_mixture() -> Distribution:
+def _ensemble() -> Distribution:
+    root = torch.randn(B, 2, D, D).double()
+    loc = 2 * torch.randn(B, 2, D).double()
+    return Ensemble(full_gaussian(loc, torch.linalg.cholesky(root @ root.mT + torch.eye(D))))
+
+
+def _low_rank_mixture() -> Distribution:
+    loc, factor = 2 * torch.randn(B, 2, D).double(), torch.randn(B, 2, D, 1).double()
+    return Mixture(torch.randn(B, 2).double(), LowRankGaussian(loc, factor, torch.ones(B, 2, D).double()))
+
+
+def _flow() -> Distribution:
+    head = FlowHead(1).double()
+    features = torch.randn(B, head.num_features(D)).double()
+    return head(features, 0.3 * torch.randn(head.num_constants(D)).double())
+
+
+def _torch_mixture() -> Distribution:
     root = torch.randn(B, 2, D, D).double()
     components = MultivariateNormal(2 * torch.randn(B, 2, D).double(), root @ root.mT + torch.eye(D))
     return MixtureSameFamily(Categorical(torch.rand(B, 2).double()), components)
@@ -73,7 +96,10 @@ FAMILIES = {
     "full": _full,
     "low_rank": _low_rank,
     "mixture": _mixture,
-    "full_mixture": _full_mixture,
+    "ensemble": _ensemble,
+    "low_rank_mixture": _low_rank_mixture,
+    "flow": _flow,
+    "torch_mixture": _torch_mixture,
     "student": _student,
 }
 
@@ -129,10 +155,23 @@ class TestEveryFamily:
 
 def test_families_keep_their_class() -> None:
     assert isinstance(temper(_full(), 2.0), MultivariateNormal)
-    assert isinstance(temper(_low_rank(), 2.0), LowRankMultivariateNormal)
-    assert isinstance(temper(_mixture(), 2.0), MixtureSameFamily)
+    assert isinstance(temper(_low_rank(), 2.0), LowRankGaussian)
+    assert type(temper(_mixture(), 2.0)) is Mixture
+    assert isinstance(temper(_ensemble(), 2.0), Ensemble)
+    assert isinstance(temper(_flow(), 2.0), CouplingFlow)
     point = Delta(torch.ones(B, D))
     assert temper(point, 2.0) is point
+
+
+def test_torchs_low_rank_gaussian_becomes_ours() -> None:
+    factor, diagonal = torch.randn(B, D, 2).double(), torch.rand(B, D).double() + 0.5
+    p, z = LowRankMultivariateNormal(torch.ones(B, D).double(), factor, diagonal), torch.randn(B, D).double()
+    hot = temper(p, 3.0)
+    assert isinstance(hot, LowRankGaussian)
+    torch.testing.assert_close(hot.covariance_matrix, 9 * p.covariance_matrix)
+    torch.testing.assert_close(
+        hot.log_prob(z), MultivariateNormal(p.mean, 9 * p.covariance_matrix).log_prob(z)
+    )
 
 
 def test_a_gaussian_at_temperature_one_is_bit_equal() -> None:

@@ -11,13 +11,20 @@ from torch.distributions import (
     Distribution,
     Independent,
     LowRankMultivariateNormal,
-    MixtureSameFamily,
     MultivariateNormal,
     Normal,
     TransformedDistribution,
 )
 
-from torchrl_vjepa.distributions import Delta, diag_gaussian
+from torchrl_vjepa.distributions import (
+    CouplingFlow,
+    Delta,
+    Ensemble,
+    LowRankGaussian,
+    Mixture,
+    diag_gaussian,
+    full_gaussian,
+)
 
 __all__ = ["temper"]
 
@@ -27,8 +34,8 @@ def temper(p: Distribution, temperature: Tensor | float) -> Distribution:
 
     Every deviation from the mean is multiplied by the temperature :math:`\tau`; the mean stays. A
     Gaussian stays one, with :math:`\tau` times its standard deviation, and is the tempered density
-    :math:`\propto p^{1/\tau^2}`. A mixture of Gaussians stays a mixture, a point mass stays as it is;
-    any other distribution becomes an affine transform of itself.
+    :math:`\propto p^{1/\tau^2}`. Mixtures, ensembles and flows stay what they are too, and a point mass
+    stays as it is; a distribution that the library does not know becomes an affine transform of itself.
 
     Args:
         p: distribution with batch ``*B`` and event ``(D,)``; its mean must be known.
@@ -66,17 +73,18 @@ def _scale_around(p: Distribution, center: Tensor, factor: Tensor | float) -> Di
     if isinstance(p, Independent) and isinstance(p.base_dist, Normal):
         loc, scale = p.base_dist.loc, p.base_dist.scale
         return diag_gaussian(center + factor * (loc - center), factor * scale)
-    if isinstance(p, MultivariateNormal):
+    if isinstance(p, (MultivariateNormal, LowRankMultivariateNormal, LowRankGaussian, CouplingFlow)):
         loc = center + factor * (p.loc - center)
-        return MultivariateNormal(loc, scale_tril=factor * p.scale_tril, validate_args=False)
-    if isinstance(p, LowRankMultivariateNormal):
-        loc = center + factor * (p.loc - center)
-        return LowRankMultivariateNormal(
-            loc, factor * p.cov_factor, factor * factor * p.cov_diag, validate_args=False
-        )
-    if isinstance(p, MixtureSameFamily):
-        components = _scale_around(p.component_distribution, center.unsqueeze(-2), factor)
-        return MixtureSameFamily(p.mixture_distribution, components, validate_args=False)
+        if isinstance(p, MultivariateNormal):
+            return full_gaussian(loc, factor * p.scale_tril)
+        if isinstance(p, LowRankMultivariateNormal):
+            return LowRankGaussian(loc, factor * p.cov_factor, factor * p.cov_diag.sqrt())
+        if isinstance(p, LowRankGaussian):
+            return LowRankGaussian(loc, factor * p.factor, factor * p.scale)
+        return CouplingFlow(loc, factor * p.scale, p.elementwise, p.couplings, num_points=p.num_points)
+    if isinstance(p, Mixture):
+        components = _scale_around(p.components, center.unsqueeze(-2), factor)
+        return Ensemble(components) if isinstance(p, Ensemble) else Mixture(p.log_weights, components)
     return _Tempered(p, center, factor)
 
 

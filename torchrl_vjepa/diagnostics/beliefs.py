@@ -12,7 +12,7 @@ from torch.distributions import (
     Normal,
 )
 
-from torchrl_vjepa.distributions import Delta, sample
+from torchrl_vjepa.distributions import Delta, LowRankGaussian, sample
 
 __all__ = ["Belief", "checked_target", "draws", "gaussian_marginals", "masked_mean"]
 
@@ -37,10 +37,10 @@ def gaussian_marginals(p: Belief) -> tuple[Tensor, Tensor] | None:
         >>> gaussian_marginals(torch.zeros(10, 2)) is None
         True
     """
-    diagonal = isinstance(p, Independent) and isinstance(p.base_dist, Normal)
-    if isinstance(p, Distribution) and (
-        diagonal or isinstance(p, (MultivariateNormal, LowRankMultivariateNormal))
-    ):
+    known = (MultivariateNormal, LowRankMultivariateNormal, LowRankGaussian)
+    if isinstance(p, Tensor):
+        return None
+    if isinstance(p, known) or (isinstance(p, Independent) and isinstance(p.base_dist, Normal)):
         return p.mean, p.variance.sqrt()
     return None
 
