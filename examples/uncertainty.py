@@ -418,9 +418,9 @@ def figure_horizons(routes: Sequence[Row], settings: Settings, path: Path) -> No
     )  # fmt: skip
     horizons = list(range(1, settings.horizon + 1))
     for scale, (above, below) in zip(scales, axes.T, strict=True):
-        above.axhspan(88, 92, color="0.9", lw=0, label="88 to 92 %")
+        above.axhspan(88, 92, color="0.9", lw=0, label="88 to 92 %; within 5 %")
         above.axhline(90, color="0.5", lw=0.8)
-        below.axhspan(1, 1.05, color="0.9", lw=0, label="within 5 %")
+        below.axhspan(1, 1.05, color="0.9", lw=0)
         below.axhline(1, color="0.5", lw=0.8)
         for route in ROUTES:
             here = [row for row in routes if row["route"] == route and row["noise_scale"] == scale]
@@ -453,7 +453,8 @@ def figure_calibration(shown: Shown, scale: float, seed: int, path: Path) -> Non
         label = f"{h} step{'s' * (h > 1)} ahead"
         left.plot(100 * shown.levels, 100 * covered, marker, color=color, ms=3.5, label=label, mfc="none")
         density = shown.pit[h]
-        right.stairs(density, torch.linspace(0, 1, len(density) + 1), color=color, label=label)
+        edges = torch.linspace(0, 1, len(density) + 1)
+        right.stairs(density, edges, baseline=None, color=color, label=label)
     left.set(xlabel="level of the interval (%)", ylabel="latents inside (%)", aspect="equal")
     right.set(
         xlabel="probability integral transform", ylabel="density", xlim=(0, 1), ylim=(0, 1.6),
