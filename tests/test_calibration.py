@@ -142,7 +142,7 @@ def test_sample_intervals_cover_exactly_on_average_however_few_samples(count: in
 def test_the_true_belief_covers_what_it_says(make: Callable[..., Distribution], joint: bool) -> None:
     target = truth(make)
     for level in (0.5, 0.9):
-        covered = coverage(make(), target, level, joint=joint, num_samples=299, generator=generator())
+        covered = coverage(make(), target, level, joint=joint, num_samples=99, generator=generator())
         # Dimensions may be dependent: the error is at most that of N independent trials.
         assert abs(covered - level) < 5 * math.sqrt(level * (1 - level) / N)
 
@@ -425,8 +425,11 @@ def test_bad_input_is_refused(measure: Callable[..., Tensor]) -> None:
         spoiled[1, 1] = bad
         with pytest.raises(ValueError, match=r"target must be finite where it counts, got .* in 1 of 10"):
             measure(p, spoiled)
-        with pytest.raises(ValueError, match="p must have a finite mean and standard deviation"):
+        with pytest.raises(ValueError, match="p must have a finite mean and a positive, finite standard dev"):
             measure(diag_gaussian(spoiled, torch.ones(D).double()), target)
+    for bad in (0.0, math.inf, math.nan):
+        with pytest.raises(ValueError, match="p must have a finite mean and a positive, finite standard dev"):
+            measure(diag_gaussian(target, torch.tensor([1.0, bad]).double()), target)
     with pytest.raises(ValueError, match=r"target must have shape \(5, 2\)"):
         measure(p, target[:4])
     with pytest.raises(TypeError, match="target must be floating point"):
@@ -512,6 +515,26 @@ def test_by_horizon_each_row_is_that_of_its_own_targets() -> None:
         assert abs(table.energy_score[h] - score.mean()) < 8 * score.std() / math.sqrt(N)
     torch.testing.assert_close(table.error, (table.coverage - table.levels).abs().mean(-1))
     assert table.error.argmin() == 1
+
+
+def test_by_horizon_masked_targets_do_not_count() -> None:
+    target = torch.randn(40, 3, D, generator=generator())
+    mask = torch.rand(40, 3, generator=generator()) < 0.6
+    p = diag_gaussian(torch.zeros(40, 3, D), torch.ones(D))
+    spoiled = torch.where(mask.unsqueeze(-1), target, math.nan)
+    table = calibration_by_horizon(p, spoiled, mask=mask, levels=[0.5], num_bins=4, num_samples=400)
+    for h in range(3):
+        kept = target[mask[:, h], h]
+        alone = calibration_by_horizon(
+            diag_gaussian(torch.zeros(len(kept), 1, D), torch.ones(D)),
+            kept.unsqueeze(1),
+            levels=[0.5],
+            num_bins=4,
+            num_samples=400,
+        )
+        for name in ("coverage", "pit_density", "crps"):
+            torch.testing.assert_close(getattr(table, name)[h], getattr(alone, name)[0])
+        torch.testing.assert_close(table.energy_score[h], alone.energy_score[0], atol=0.05, rtol=0)
 
 
 def test_by_horizon_of_a_sampled_rollout() -> None:

@@ -9,7 +9,7 @@ from torchrl_vjepa.diagnostics.calibration import (
 from torchrl_vjepa.diagnostics.information import mutual_information_bound
 from torchrl_vjepa.diagnostics.intervals import (
     CredibleInterval,
-    Histogram,
+    PITHistogram,
     ReliabilityCurve,
     coverage,
     credible_interval,
@@ -24,7 +24,7 @@ from torchrl_vjepa.statistics import effective_rank
 __all__ = [
     "Calibration",
     "CredibleInterval",
-    "Histogram",
+    "PITHistogram",
     "LinearProbe",
     "ReliabilityCurve",
     "calibration_by_horizon",

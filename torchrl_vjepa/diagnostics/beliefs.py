@@ -92,8 +92,8 @@ def checked_target(p: Belief, target: Tensor, mask: Tensor | None = None) -> tup
 
     Raises:
         TypeError: if the target is not floating point or the mask not boolean.
-        ValueError: if shapes do not fit, or a value of the target, or of the mean of the belief, is NaN
-            or infinite where it counts.
+        ValueError: if shapes do not fit, or where it counts a value of the target or of the belief's mean
+            is NaN or infinite, or a Gaussian has no width.
 
     Examples:
         >>> import torch
@@ -130,11 +130,13 @@ def checked_target(p: Belief, target: Tensor, mask: Tensor | None = None) -> tup
             f"{int((~target.isfinite()).sum())} of {target.numel()} entries; drop them or mask them out"
         )
     # Samples are checked where they are drawn.
-    known = (p.mean,) if isinstance(p, Delta) else gaussian_marginals(p) or ()
-    for statistic in known:
-        good = statistic.isfinite()
+    mean, std = (p.mean, None) if isinstance(p, Delta) else gaussian_marginals(p) or (None, None)
+    if mean is not None:
+        good = mean.isfinite() if std is None else mean.isfinite() & std.isfinite() & (std > 0)
         if not (good if mask is None else good | ~mask.unsqueeze(-1)).all():
-            raise ValueError("p must have a finite mean and standard deviation where the target counts")
+            raise ValueError(
+                "p must have a finite mean and a positive, finite standard deviation where the target counts"
+            )
     return target, mask
 
 

@@ -264,8 +264,8 @@ def recalibrate(
                 "of reach"
             )
         factors.append(factor)
-    before = torch.ones(()) if predictor.temperature is None else predictor.temperature.cpu()
-    predictor.set_temperature(before * torch.tensor(factors))
+    before = 1.0 if predictor.temperature is None else predictor.temperature.cpu()
+    predictor.set_temperature(before * torch.tensor(factors, dtype=torch.float64))
     # Set just now, and never None.
     return predictor.get_buffer("temperature").clone()
 

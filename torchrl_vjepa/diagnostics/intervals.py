@@ -16,7 +16,7 @@ from torchrl_vjepa.distributions import Delta
 __all__ = [
     "LEVELS",
     "CredibleInterval",
-    "Histogram",
+    "PITHistogram",
     "ReliabilityCurve",
     "check_level",
     "coverage",
@@ -250,7 +250,7 @@ def probability_integral_transform(
     return values if mask is None else torch.where(mask.unsqueeze(-1), values, torch.nan)
 
 
-class Histogram(NamedTuple):
+class PITHistogram(NamedTuple):
     """A density on [0, 1] by bins of equal width.
 
     Attributes:
@@ -267,8 +267,8 @@ class Histogram(NamedTuple):
     edges: Tensor
 
 
-def pit_histogram(values: Tensor, num_bins: int = 10) -> Histogram:
-    r"""Histogram of probability integral transforms: flat if calibrated.
+def pit_histogram(values: Tensor, num_bins: int = 10) -> PITHistogram:
+    r"""PITHistogram of probability integral transforms: flat if calibrated.
 
     A valley says that the belief is too narrow, a hill that it is too wide, a slope that it is biased.
 
@@ -300,7 +300,7 @@ def pit_histogram(values: Tensor, num_bins: int = 10) -> Histogram:
     index = (values * num_bins).long().clamp_max(num_bins - 1)
     counts = torch.bincount(index.reshape(-1), minlength=num_bins).to(values.dtype)
     edges = torch.linspace(0, 1, num_bins + 1, dtype=values.dtype, device=values.device)
-    return Histogram(counts * (num_bins / values.numel()), edges)
+    return PITHistogram(counts * (num_bins / values.numel()), edges)
 
 
 class ReliabilityCurve(NamedTuple):
