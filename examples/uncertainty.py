@@ -1,10 +1,10 @@
 """Is the uncertainty of a VJEPA right? Beliefs about the noisy TV against the exact predictive distribution.
 
-A VJEPA is trained on one long trajectory by the robust recipe of noisy_tv_table.py. On its frozen latents a
-Gaussian belief is fitted for each horizon: direct prediction, one skip for each horizon, and one temperature
-for each skip on a part of the trajectory that was held out. On fresh trajectories the script measures how
-often 90 % intervals hold the latent that came true, and the CRPS of the signal (through a linear probe)
-beside that of the Kalman filter, which knows the system.
+A VJEPA is trained by the robust recipe of noisy_tv_table.py. On its frozen latents a Gaussian belief is
+fitted for each horizon: direct prediction, one skip for each horizon, and one temperature for each skip on
+trajectories that training did not see. On fresh ones the script measures how often 90 % intervals hold the
+latent that came true, and the CRPS of the signal (through a linear probe) beside that of the Kalman filter,
+which knows the system.
 
 Why direct prediction: the latent is a linear function of the observation, z = M s + n, and carries the
 sensor noise n. So the latents of a Markov signal are not Markov (VARMA(1, 1), not VAR(1)). The error of a
@@ -89,10 +89,10 @@ class Settings:
     sizes: list[int] = option(
         [4, 4, 20], "of the system", nargs=3, metavar=("SIGNAL", "DISTRACTOR", "OBSERVATION")
     )
-    train_length: int = option(20_000, "steps of the training trajectory")
-    held_out: float = option(0.4, "its last part, which only the temperatures see")
-    test_trajectories: int = option(100, "fresh trajectories to measure on")
-    test_length: int = option(500, "steps of each")
+    length: int = option(500, "steps of a trajectory")
+    train_trajectories: int = option(24, "trajectories that encoder and beliefs learn from")
+    held_out_trajectories: int = option(16, "trajectories for the temperatures")
+    test_trajectories: int = option(100, "trajectories to measure on")
     steps: int = option(800, "optimiser steps")
     restarts: int = option(6, "starts trained side by side; the objective chooses one")
     skips: list[int] = option([1, 4, 16], "prediction steps that the encoder learns from")
@@ -106,9 +106,8 @@ class Settings:
 QUICK = {
     "noise_scales": [0.0, 8.0],
     "horizon": 4,
-    "train_length": 3000,
+    "length": 100,
     "test_trajectories": 20,
-    "test_length": 100,
     "steps": 100,
     "restarts": 2,
     "workers": 1,
@@ -129,17 +128,15 @@ class Data(NamedTuple):
         """Every noise scale of a seed has the same signal, distractor and sensor noise."""
         system = LinearGaussianSystem(*settings.sizes, seed=seed)
         generator = torch.Generator().manual_seed(seed)
-        trajectory = system.simulate(settings.train_length, noise_scale, generator=generator)
-        test = system.simulate(
-            settings.test_length, noise_scale, batch_size=(settings.test_trajectories,), generator=generator
+        sizes = [settings.train_trajectories, settings.held_out_trajectories, settings.test_trajectories]
+        everything = system.simulate(
+            settings.length, noise_scale, batch_size=(sum(sizes),), generator=generator
         )
-        split = round((1 - settings.held_out) * settings.train_length)
         whitening = Whitening(system.observation_dim)
-        whitening.update(trajectory["observation"][:split])
-        for data in (trajectory, test):
-            data["raw"] = data["observation"]
-            data["observation"] = whitening(data["raw"])
-        return cls(system, noise_scale, trajectory[:split], trajectory[split:], test)
+        whitening.update(everything["observation"][: sizes[0]])
+        everything["raw"] = everything["observation"]
+        everything["observation"] = whitening(everything["raw"])
+        return cls(system, noise_scale, *everything.split(sizes))
 
 
 # Training: the robust recipe, all noise scales and starts of a seed as one batch
@@ -184,23 +181,26 @@ def train(runs: Sequence[Data], seed: int, settings: Settings) -> list[VJEPA]:
     )
     observations = torch.stack([run.train["observation"] for run in runs])
 
-    def batch(starts: Tensor) -> TensorDict:
-        windows = observations[:, starts.unsqueeze(1) + torch.arange(settings.window)]
+    # Every window of every trajectory: (scale, window, step, feature).
+    observations = observations.unfold(2, settings.window, 1).mT.flatten(1, 2)
+
+    def batch(index: Tensor) -> TensorDict:
+        windows = observations[:, index]
         windows = windows.repeat_interleave(settings.restarts, dim=0)
         return TensorDict(observation=windows, batch_size=windows.shape[:-1])
 
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
-    last = observations.shape[1] - settings.window
     for _ in range(settings.steps):
-        starts = torch.randint(last + 1, (settings.windows,), generator=generator)
-        objective(loss(batch(starts))).sum().backward()
+        index = torch.randint(observations.shape[1], (settings.windows,), generator=generator)
+        objective(loss(batch(index))).sum().backward()
         optimizer.step()
         optimizer.zero_grad()
         schedule.step()
         updater.step()
     with torch.no_grad():
-        score = loss(batch(torch.arange(0, last + 1, settings.window)))["mutual_information"]
+        every = torch.arange(0, observations.shape[1], settings.window)
+        score = loss(batch(every))["mutual_information"]
     best = score.reshape(len(runs), settings.restarts).argmax(1).tolist()
     return [loss.get_model(i * settings.restarts + restart) for i, restart in enumerate(best)]
 
@@ -216,14 +216,17 @@ def fit_belief(model: VJEPA, data: TensorDict, horizon: int) -> VJEPA:
     """
     latent = model.encoder(data.select("observation"))["latent"].detach().double()
     dim = latent.shape[-1]
-    belief = Predictor(dim, head=FullGaussianHead("constant"), skips=range(1, horizon + 1)).double()
+    # With a bias, because whitening moves the origin.
+    belief = Predictor(dim, head=FullGaussianHead("constant"), skips=range(1, horizon + 1), bias=True)
+    belief = belief.double()
     points = []
     with torch.no_grad():
         for skip, trunk in zip(belief.skips, belief.trunks, strict=True):
-            context, target = latent[:-skip], latent[skip:]
-            solution = torch.linalg.lstsq(context, target).solution
+            context, target = latent[:, :-skip].flatten(0, 1), latent[:, skip:].flatten(0, 1)
+            solution = torch.linalg.lstsq(context - context.mean(0), target - target.mean(0)).solution
             trunk.weight.copy_(solution.mT)
-            error = target - context @ solution
+            trunk.bias.copy_(target.mean(0) - context.mean(0) @ solution)
+            error = target - trunk(context)
             root = torch.linalg.cholesky(error.mT @ error / len(error)).mT * dim**0.5
             points.append(torch.cat([root, -root]))
     constants = belief.constants
@@ -256,13 +259,14 @@ def direct(belief: VJEPA, latent: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def iterated(belief: VJEPA, latent: Tensor) -> tuple[Tensor, Tensor]:
-    """The same by the one-step belief, iterated: ``m' = A m``, ``P' = A P A^T + S``."""
-    matrix = belief.predictor.trunks[0].weight
+    """The same by the one-step belief, iterated: ``m' = A m + b``, ``P' = A P A^T + S``."""
+    one_step = belief.predictor.trunks[0]
+    matrix = one_step.weight
     noise = belief.predictor.dist(latent, skip=1).covariance_matrix.flatten(0, -3)[0]
     mean, covariance = latent, torch.zeros_like(noise)
     means, covariances = [], []
     for _ in belief.predictor.skips:
-        mean, covariance = mean @ matrix.mT, matrix @ covariance @ matrix.mT + noise
+        mean, covariance = one_step(mean), matrix @ covariance @ matrix.mT + noise
         means.append(mean)
         covariances.append(covariance)
     return torch.stack(means, dim=-2), torch.stack(covariances)
@@ -316,7 +320,7 @@ def measure(model: VJEPA, data: Data, seed: int, settings: Settings) -> tuple[li
     starts = latents[1][:, BURN_IN:-horizon]
     target, signal = ahead(latents[1], horizon), ahead(data.test["signal"].double(), horizon)
     predictions = {"iterated": iterated(belief, starts), "direct": direct(belief, starts)}
-    recalibrate(belief, data.held_out.select("observation").double().unsqueeze(0))
+    recalibrate(belief, data.held_out.select("observation").double())
     predictions["direct, recalibrated"] = direct(belief, starts)
 
     exact = kalman(data, horizon)
@@ -528,10 +532,10 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Na
     given = {entry.name: getattr(args, entry.name) for entry in fields(Settings)}
     given = {name: value for name, value in given.items() if value is not None}
     settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
-    if settings.horizon < 1 or settings.test_length <= settings.horizon + BURN_IN:
-        parser.error(f"--test-length must be more than --horizon + {BURN_IN}, and --horizon at least 1")
-    if not 0 < settings.held_out < 1:
-        parser.error(f"--held-out must be in (0, 1), got {settings.held_out}")
+    if settings.horizon < 1 or settings.length <= settings.horizon + BURN_IN:
+        parser.error(f"--length must be more than --horizon + {BURN_IN}, and --horizon at least 1")
+    if settings.window <= max(settings.skips) or settings.length < settings.window:
+        parser.error("--window must be more than the largest of --skips, and at most --length")
     return settings, args
 
 
