@@ -124,17 +124,18 @@ class CouplingFlow(NoiseDistribution):
     @property
     def mean(self) -> Tensor:
         """Average of the fixed points, ``(*B, D)``."""
-        return self._points().mean(0)
+        return self.loc + self._deviations().mean(0)
 
     @property
     def variance(self) -> Tensor:
         """Variance of the fixed points, ``(*B, D)``."""
-        return self._points().var(0, correction=0)
+        points = self._deviations()
+        return (points - points.mean(0)).square().mean(0)
 
     @property
     def covariance_matrix(self) -> Tensor:
         """Covariance of the fixed points, ``(*B, D, D)``."""
-        points = self._points()
+        points = self._deviations()
         centred = (points - points.mean(0)).movedim(0, -1)
         return centred @ centred.mT / points.shape[0]
 
@@ -144,11 +145,9 @@ class CouplingFlow(NoiseDistribution):
 
         Its gradient is that of the transform at fixed noise.
         """
-        starts, _, _ = self.search_space()
         with torch.no_grad():
-            point, _ = maximize_log_prob(self)
-            noise, _ = self.to_noise(point)
-        return self.from_noise(noise.to(starts.dtype))
+            noise, _ = self.to_noise(maximize_log_prob(self, num_steps=50)[0])
+        return self.from_noise(noise)
 
     def to_noise(self, value: Tensor) -> tuple[Tensor, Tensor]:
         r"""The inverse, :math:`\epsilon = T^{-1}(Z)`.
@@ -176,11 +175,7 @@ class CouplingFlow(NoiseDistribution):
         Returns:
             Latents of shape ``(*S, *B, D)``.
         """
-        value = noise
-        for layer in reversed(self.couplings):
-            value, _ = layer(value, inverse=True)
-        value, _ = spline(value, self.elementwise, inverse=True)
-        return self.loc + self.scale * value
+        return self.loc + self._deviation(noise)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density, in nats.
@@ -195,15 +190,18 @@ class CouplingFlow(NoiseDistribution):
         return log_det - 0.5 * (noise.square().sum(-1) + noise.shape[-1] * math.log(2 * math.pi))
 
     def search_space(self) -> SearchSpace:
-        """Starts at the centre of the noise and at 16 of the fixed points.
+        """Starts at the four most probable of 65 fixed points, in the space of the noise.
 
         Returns:
-            Starts ``(17, *B, D)`` and the transform, from noise to latents.
+            Starts ``(4, *B, D)`` and the transform, from noise to latents.
         """
-        points = normal_points(16, self.event_shape[0]).to(self.loc)
-        starts = torch.cat([torch.zeros_like(points[:1]), points[:16]])
-        starts = starts.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0])
-        starts = starts.expand(-1, *self.batch_shape, -1).contiguous()
+        points = normal_points(64, self.event_shape[0]).to(self.loc)
+        points = torch.cat([torch.zeros_like(points[:1]), points])
+        points = points.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0])
+        points = points.expand(-1, *self.batch_shape, -1)
+        with torch.no_grad():
+            best = self.log_prob(self.from_noise(points)).topk(4, dim=0).indices
+        starts = torch.take_along_dim(points, best.unsqueeze(-1), 0)
         return starts, self.from_noise, torch.ones_like(self.loc)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> CouplingFlow:
@@ -218,9 +216,17 @@ class CouplingFlow(NoiseDistribution):
         loc = self.loc.expand(*batch_shape, -1)
         return CouplingFlow(loc, self.scale, self.elementwise, self.couplings, num_points=self.num_points)
 
-    def _points(self) -> Tensor:
+    def _deviation(self, noise: Tensor) -> Tensor:
+        """Draws without the location, whose digits they would lose beside a large one."""
+        for layer in reversed(self.couplings):
+            noise, _ = layer(noise, inverse=True)
+        return self.scale * spline(noise, self.elementwise, inverse=True)[0]
+
+    def _deviations(self) -> Tensor:
+        """Of the fixed points, ``(P, *B, D)``."""
         points = normal_points(self.num_points, self.event_shape[0]).to(self.loc)
-        return self.from_noise(points.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0]))
+        noise = points.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0])
+        return self._deviation(noise).expand(-1, *self.batch_shape, -1)
 
 
 @lru_cache(maxsize=32)

@@ -174,7 +174,9 @@ class LowRankGaussian(NoiseDistribution):
         factor, scale = full_precision(self.factor, self.scale)
         whitened = factor / scale.unsqueeze(-1)
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
-        return whitened, torch.linalg.cholesky(eye + whitened.mT @ whitened)
+        capacitance, failed = torch.linalg.cholesky_ex(eye + whitened.mT @ whitened)
+        # NaN stays where it is: an error would stop every other model that trains in the same batch.
+        return whitened, torch.where(failed[..., None, None] == 0, capacitance, torch.nan)
 
     def log_det(self) -> Tensor:
         """Logarithm of the covariance's determinant.

@@ -176,12 +176,24 @@ class Mixture(NoiseDistribution):
         return self._implicit(drawn) if torch.is_grad_enabled() else drawn
 
     def search_space(self) -> SearchSpace:
-        """Starts at the means of the components.
+        """Starts where the components' own searches start, in their coordinates: the means of Gaussians.
 
         Returns:
-            Starts ``(K, *B, D)``, the identity, and the components' standard deviations.
+            Starts ``(S, *B, n)``, the map from there to latents, and the scale of the starts.
         """
-        return self.components.mean.movedim(-2, 0), torch.clone, self.components.stddev.movedim(-2, 0)
+        p = self.components
+        if isinstance(p, NoiseDistribution):
+            inner, inner_map, unit = p.search_space()
+        else:
+            inner, inner_map, unit = p.mean.unsqueeze(0), torch.clone, p.stddev
+        num = inner.shape[0]
+
+        def to_point(variables: Tensor) -> Tensor:
+            variables = variables.unflatten(0, (num, -1)).movedim(1, -2)
+            return inner_map(variables).movedim(-2, 1).flatten(0, 1)
+
+        unit = unit.expand_as(inner)
+        return inner.movedim(-2, 1).flatten(0, 1), to_point, unit.movedim(-2, 1).flatten(0, 1)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> Mixture:
         """The same mixture, broadcast to ``batch_shape``.
