@@ -268,28 +268,30 @@ def test_reset_forgets_it() -> None:
     assert torch.equal(model.predictor.temperature, torch.ones(3))
 
 
-@pytest.mark.parametrize("several", [False, True])
-def test_the_likelihood_of_a_loss_feels_it(several: bool) -> None:
+def test_the_likelihood_of_a_loss_feels_it_and_models_of_a_list_have_their_own() -> None:
     data = TensorDict(observation=torch.randn(2, 7, 6), batch_size=(2, 7))
-    fresh = [VJEPA(linear_encoder(6, D), _predictor()) for _ in range(2)]
-    values = []
-    for factor in (None, 3.0):
-        models = copy.deepcopy(fresh)
-        for model in models:
-            model.predictor.set_temperature(None if factor is None else [factor] * 3)
-        loss = VJEPALoss(models if several else models[0], collapse_rank=0.0)
+    models = [VJEPA(linear_encoder(6, D), _predictor()) for _ in range(2)]
+
+    def nll(models: VJEPA | list[VJEPA]) -> Tensor:
+        loss = VJEPALoss(copy.deepcopy(models), collapse_rank=0.0)
         updater = SoftUpdate(loss, eps=0.9)
         with torch.random.fork_rng():
             torch.manual_seed(2)
-            losses = loss(data)
-        losses["loss_nll"].sum().backward()
+            value = loss(data)["loss_nll"]
+        value.sum().backward()
         updater.step()
-        values.append(losses["loss_nll"].detach().sum())
-    assert not torch.isclose(*values)
+        return value.detach()
+
+    before = nll(models)
+    for model, factor in zip(models, (3.0, 0.5), strict=True):
+        model.predictor.set_temperature([factor, 1.0, 1.0])
+    after = nll(models)
+    assert not torch.isclose(after, before).any()
+    torch.testing.assert_close(after, torch.stack([nll(model) for model in models]))
     # Models with and without one are not of one architecture.
-    fresh[0].predictor.set_temperature([1.0] * 3)
+    models[0].predictor.set_temperature(None)
     with pytest.raises(ValueError, match="differ in name or shape"):
-        VJEPALoss(fresh)
+        VJEPALoss(models)
 
 
 def test_it_is_no_parameter() -> None:
