@@ -137,6 +137,14 @@ def test_sample_intervals_cover_exactly_on_average_however_few_samples(count: in
     assert inside.mean(0) == pytest.approx(level, abs=5 * math.sqrt(level * (1 - level) / rounds))
 
 
+@pytest.mark.parametrize("count", [19, 20, 57])
+def test_sample_intervals_are_numpys_quantiles(count: int) -> None:
+    samples = truth(laplace, count).unsqueeze(1)
+    expected = np.quantile(samples.numpy(), [0.05, 0.95], axis=0, method="weibull")
+    for end, value in zip(credible_interval(samples, 0.9), expected, strict=True):
+        np.testing.assert_allclose(end.numpy(), value, rtol=1e-12)
+
+
 @EVERY_FAMILY
 @pytest.mark.parametrize("joint", [False, True])
 def test_the_true_belief_covers_what_it_says(make: Callable[..., Distribution], joint: bool) -> None:
