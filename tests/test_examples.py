@@ -53,6 +53,7 @@ CLIFF_KEYS = {
     "fall_rate",
     "success_rate",
 }
+UNCERTAINTY_KEYS = {"noise_scale", "seed", "horizon", "coverage_90", "crps", "oracle_crps"}
 # "path:line: Category: message", raised at a line of this repository
 WARNING = re.compile(r"\S*(?:torchrl_vjepa|examples)/\S*\.py:\d+: \w*Warning: .*")
 
@@ -195,11 +196,36 @@ def check_cliff_report(report: dict[str, Any]) -> None:
         assert 0 <= row["success_rate"] <= 1 - row["fall_rate"] + 1e-6
 
 
+def check_uncertainty_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``uncertainty.py``: one row for each scale, seed and horizon, per route too."""
+    assert set(report) == {"settings", "wall_s", "rows", "routes"}
+    settings, rows, routes = report["settings"], report["rows"], report["routes"]
+    assert report["wall_s"] > 0
+    cells = [(row["noise_scale"], row["seed"], row["horizon"]) for row in rows]
+    horizons = range(1, settings["horizon"] + 1)
+    expected = {(x, s, h) for x in settings["noise_scales"] for s in settings["seeds"] for h in horizons}
+    assert len(cells) == len(expected)
+    assert set(cells) == expected
+    for row in rows:
+        assert set(row) == UNCERTAINTY_KEYS
+        assert isinstance(row["seed"], int)
+        assert 0 <= row["coverage_90"] <= 1
+        assert row["crps"] > 0
+        assert row["oracle_crps"] > 0
+        assert row["crps"] > 0.98 * row["oracle_crps"], "nothing beats the truth by more than chance"
+    assert len(routes) == 3 * len(rows)
+    main = {(r["noise_scale"], r["seed"], r["horizon"]): r for r in routes if "recalibrated" in r["route"]}
+    for cell, row in zip(cells, rows, strict=True):
+        assert main[cell]["coverage_90"] == row["coverage_90"]
+        assert math.isclose(main[cell]["crps_ratio"], row["crps"] / row["oracle_crps"], rel_tol=1e-9)
+
+
 CHECKS = {
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,
     "surprise": check_surprise_report,
     "cliff": check_cliff_report,
+    "uncertainty": check_uncertainty_report,
 }
 
 

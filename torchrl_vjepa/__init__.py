@@ -14,7 +14,25 @@ from torchrl_vjepa.belief import (
     systematic_resampling,
 )
 from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, quadratic_cost
-from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
+from torchrl_vjepa.diagnostics import (
+    Calibration,
+    CredibleInterval,
+    LinearProbe,
+    PITHistogram,
+    ReliabilityCurve,
+    calibration_by_horizon,
+    calibration_by_skip,
+    coverage,
+    credible_interval,
+    crps,
+    energy_score,
+    linear_probe,
+    mutual_information_bound,
+    pit_histogram,
+    probability_integral_transform,
+    recalibrate,
+    reliability_curve,
+)
 from torchrl_vjepa.distributions import (
     CouplingFlow,
     Delta,
@@ -71,6 +89,7 @@ from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import GaussianPrior
 from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
+from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
@@ -79,10 +98,12 @@ __all__ = [
     "BJEPALoss",
     "BatchedNoisyTVEnv",
     "CEM",
+    "Calibration",
     "ChanceConstraint",
     "CollapseWarning",
     "Cost",
     "CouplingFlow",
+    "CredibleInterval",
     "Delta",
     "DeltaHead",
     "DiagGaussianHead",
@@ -110,6 +131,7 @@ __all__ = [
     "Mixture",
     "MixtureHead",
     "NoisyTVEnv",
+    "PITHistogram",
     "ParticleBelief",
     "ParticleFilter",
     "PixelAR",
@@ -121,6 +143,7 @@ __all__ = [
     "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",
+    "ReliabilityCurve",
     "RewardLoss",
     "Selection",
     "TargetScale",
@@ -131,11 +154,17 @@ __all__ = [
     "Whitening",
     "WindowLoss",
     "action_cost",
+    "calibration_by_horizon",
+    "calibration_by_skip",
     "composition_gap",
+    "coverage",
+    "credible_interval",
+    "crps",
     "cvar",
     "diag_gaussian",
     "effective_rank",
     "effective_sample_size",
+    "energy_score",
     "entropic",
     "entropy_bounds",
     "expectation",
@@ -152,15 +181,20 @@ __all__ = [
     "monte_carlo_entropy",
     "monte_carlo_kl",
     "mutual_information_bound",
+    "pit_histogram",
     "point_estimate",
+    "probability_integral_transform",
     "product_of_experts",
     "propagate_moments",
     "quadratic_cost",
+    "recalibrate",
+    "reliability_curve",
     "rollout",
     "sample",
     "select_best",
     "sliced_gaussian_distance",
     "surprise",
     "systematic_resampling",
+    "temper",
     "worst_case",
 ]

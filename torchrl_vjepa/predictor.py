@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +16,7 @@ from torchrl.modules import MLP
 from torchrl_vjepa.distributions import point_estimate, product_of_experts
 from torchrl_vjepa.heads import DiagGaussianHead, Head
 from torchrl_vjepa.stacking import linear
+from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.windows import read
 
 __all__ = ["FusedPredictor", "Predictor"]
@@ -108,6 +109,12 @@ class Predictor(_Transition):
         side_info_key: where the side information is read.
         out_key: where the prediction is written.
 
+    Attributes:
+        temperature: what every skip's deviations from its mean are multiplied with
+            (:func:`~torchrl_vjepa.temperature.temper`), of shape ``(len(skips),)``: a buffer, set by
+            :meth:`set_temperature` or :func:`~torchrl_vjepa.diagnostics.recalibrate`. ``None``, with
+            nothing computed and nothing in the state dict, is 1.
+
     Raises:
         ValueError: if a size, a skip, ``trunk`` or ``how`` is not valid.
 
@@ -119,6 +126,8 @@ class Predictor(_Transition):
         >>> predictor.dist(torch.zeros(7, 4), torch.zeros(7, 3, 2), skip=3).variance.shape
         torch.Size([7, 4])
     """
+
+    temperature: Tensor | None
 
     def __init__(
         self,
@@ -182,6 +191,7 @@ class Predictor(_Transition):
                 ]
             )
         self.constants = nn.Parameter(self._init_constants())
+        self.register_buffer("temperature", None)
         self.latent_key, self.action_key, self.side_info_key = latent_key, action_key, side_info_key
         self.in_keys = [latent_key]
         if action_dim:
@@ -191,9 +201,11 @@ class Predictor(_Transition):
         self.out_keys = [out_key]
 
     def reset_parameters(self) -> None:
-        """New constants of the head (the trunks reset themselves)."""
+        """New constants of the head, temperatures of 1 (the trunks reset themselves)."""
         with torch.no_grad():
             self.constants.copy_(self._init_constants())
+            if self.temperature is not None:
+                self.temperature.fill_(1.0)
 
     def _init_constants(self) -> Tensor:
         return torch.stack([self.head.init_constants(self.latent_dim) for _ in self.skips])
@@ -204,6 +216,37 @@ class Predictor(_Transition):
         if module is self:
             self.reset_parameters()
         return any_reset
+
+    def set_temperature(self, temperature: Tensor | Sequence[float] | None) -> None:
+        """Widen or narrow the predictive distribution of every skip around its mean.
+
+        Args:
+            temperature: one positive number for each of ``skips``, in their order; ``None`` for 1, as
+                the head says.
+
+        Raises:
+            ValueError: if it has another shape or is not positive and finite.
+        """
+        if temperature is None:
+            self.temperature = None
+            return
+        value = torch.as_tensor(temperature).detach().to(self.constants).clone()
+        if value.shape != (len(self.skips),):
+            raise ValueError(
+                f"temperature must have shape ({len(self.skips)},), one number for each of "
+                f"skips={self.skips}, got {tuple(value.shape)}"
+            )
+        if not bool((value.isfinite() & (value > 0)).all()):
+            raise ValueError(f"temperature must be positive and finite, got {value.tolist()}")
+        self.temperature = value
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # A buffer that is None is not in the state dict, so whether there is one is part of the state.
+        if prefix + "temperature" not in state_dict:
+            self.temperature = None
+        elif self.temperature is None:
+            self.temperature = self.constants.new_ones(len(self.skips))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def dist(
         self,
@@ -259,12 +302,13 @@ class Predictor(_Transition):
                 dim=-1,
             )
         constants = self.constants[index] if self.constants.ndim == 2 else self.constants[:, index, None]
-        return self.head(features, constants)
+        p = self.head(features, constants)
+        return p if self.temperature is None else temper(p, self.temperature[index])
 
     @property
     def stackable(self) -> bool:
         """Whether :meth:`dist` takes the stacked weights of several models (``linear``)."""
-        return self.trunk == "linear" and self.head.stackable
+        return self.trunk == "linear" and self.head.stackable and self.temperature is None
 
     def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
         batch = latent.shape[:-1]

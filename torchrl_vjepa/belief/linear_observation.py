@@ -89,8 +89,6 @@ class LinearObservation(nn.Module):
 
         Returns:
             Gaussian with batch ``(*B, K)`` and event ``(D,)``.
-
-        Raises:
         """
         mean, covariance = moments(p)
         factor = torch.linalg.cholesky(covariance)
