@@ -21,7 +21,9 @@ PACKAGE = ROOT / "torchrl_vjepa"
 # Files and folders directly under the package; a folder's leaves share its layer.
 LAYERS = {
     "distributions": 0,
+    "fork": 0,
     "noisy_tv": 0,
+    "simulation": 0,
     "statistics": 0,
     "windows": 0,
     "belief": 1,
@@ -40,6 +42,8 @@ LAYERS = {
 }
 # Who may import whom within one layer.
 SIDEWAYS = {
+    ("fork", "simulation"),
+    ("noisy_tv", "simulation"),
     ("encoders", "whitening"),
     ("baselines", "models"),
     ("baselines", "objectives"),

@@ -7,6 +7,7 @@ from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_informat
 from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.fork import BatchedForkEnv, ForkEnv, ForkSystem
 from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale
 from torchrl_vjepa.models import BJEPA, JEPA, VJEPA, LatentModel
 from torchrl_vjepa.noisy_tv import (
@@ -34,6 +35,7 @@ from torchrl_vjepa.whitening import Whitening
 __all__ = [
     "BJEPA",
     "BJEPALoss",
+    "BatchedForkEnv",
     "BatchedNoisyTVEnv",
     "CEM",
     "CollapseWarning",
@@ -42,6 +44,8 @@ __all__ = [
     "DeltaHead",
     "DiagGaussianHead",
     "EnvObjective",
+    "ForkEnv",
+    "ForkSystem",
     "FusedPredictor",
     "GaussianPrior",
     "Head",
