@@ -10,13 +10,8 @@ vehicle gets past it.
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
-from statistics import mean
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib as mpl
@@ -25,7 +20,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution
-from torchrl import logger
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
@@ -49,8 +43,6 @@ from torchrl_vjepa import (
 )
 
 mpl.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.patches import Rectangle
 
 HEADS: dict[str, Callable[[], Head]] = {
     "DiagGaussianHead": DiagGaussianHead,
@@ -144,9 +136,7 @@ def train(head: str, data: TensorDict, seed: int, settings: Settings) -> VJEPA:
     )
     loss = VJEPALoss(model, target_kl_coeff=0.0, marginal_entropy_coeff=1.0)
     updater = SoftUpdate(loss, eps=settings.ema_decay)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(len(data)), batch_size=settings.batch_size
-    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(data)), batch_size=settings.batch_size)
     buffer.set_rng(torch.Generator().manual_seed(seed))
     buffer.extend(data)
     optimizer = torch.optim.Adam(loss.parameters(), lr=settings.lr, fused=True)
@@ -226,9 +216,7 @@ def drive(policy: Any, system: ForkSystem, seed: int, settings: Settings) -> Ten
     torch.manual_seed(seed)
     env = BatchedForkEnv(settings.episodes, system, seed=100_000 + 1_000 * seed)
     with torch.no_grad():
-        return env.rollout(
-            system.episode_length, policy, break_when_any_done=False, break_when_all_done=True
-        )
+        return env.rollout(system.episode_length, policy, break_when_any_done=False, break_when_all_done=True)
 
 
 def success(episodes: TensorDict) -> float:

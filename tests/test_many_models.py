@@ -20,8 +20,13 @@ from torchrl_vjepa import (
     BJEPALoss,
     DeltaHead,
     DiagGaussianHead,
+    EnsembleHead,
+    FlowHead,
+    FullGaussianHead,
     GaussianPrior,
     JEPALoss,
+    LowRankGaussianHead,
+    MixtureHead,
     PixelAR,
     PixelARLoss,
     PixelDecoder,
@@ -61,6 +66,16 @@ def bjepa_fixed(i: int) -> nn.Module:
     return BJEPA(linear_encoder(OBS, LATENT), Predictor(LATENT, ACTION), structural_prior=prior)
 
 
+def with_head(head: Callable[[], nn.Module], trunk: str = "linear") -> Callable[[int], nn.Module]:
+    """A BJEPA, whose loss asks for everything: likelihood, draws of the target, a divergence."""
+
+    def build(i: int) -> nn.Module:
+        predictor = Predictor(LATENT, ACTION, head=head(), skips=(1, 2), trunk=trunk, num_cells=[5])
+        return BJEPA(linear_encoder(OBS, LATENT), predictor)
+
+    return build
+
+
 def vae(i: int) -> nn.Module:
     return VAE(OBS, LATENT)
 
@@ -76,6 +91,11 @@ CASES: dict[str, tuple[Callable[..., Any], Callable[[int], nn.Module], dict[str,
     "VJEPA batch": (VJEPALoss, vjepa, {**REGULARISERS, "residual_variance": "batch"}),
     "BJEPA": (BJEPALoss, bjepa, {**REGULARISERS, "structural_kl_coeff": 0.4}),
     "BJEPA fixed full prior": (BJEPALoss, bjepa_fixed, REGULARISERS),
+    "BJEPA full": (BJEPALoss, with_head(FullGaussianHead), {}),
+    "BJEPA low rank": (BJEPALoss, with_head(lambda: LowRankGaussianHead(1), "mlp"), {}),
+    "BJEPA mixture": (BJEPALoss, with_head(lambda: MixtureHead(2)), {"num_kl_samples": 4}),
+    "BJEPA flow": (BJEPALoss, with_head(lambda: FlowHead(2, 4, 3), "mlp"), {"num_kl_samples": 4}),
+    "BJEPA ensemble": (BJEPALoss, with_head(lambda: EnsembleHead(None, 2, 4)), {"num_kl_samples": 4}),
     "VAE": (VAELoss, vae, {"kl_coeff": 0.5}),
     "PixelAR": (PixelARLoss, pixel_ar, {}),
 }

@@ -4,11 +4,38 @@ from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAE
 from torchrl_vjepa.belief import rollout
 from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, expectation, quadratic_cost
 from torchrl_vjepa.diagnostics import LinearProbe, linear_probe, mutual_information_bound
-from torchrl_vjepa.distributions import Delta, diag_gaussian, point_estimate, product_of_experts, sample
+from torchrl_vjepa.distributions import (
+    CouplingFlow,
+    Delta,
+    Ensemble,
+    LowRankGaussian,
+    Mixture,
+    diag_gaussian,
+    entropy_bounds,
+    full_gaussian,
+    kl_divergence,
+    maximize_log_prob,
+    moments,
+    monte_carlo_entropy,
+    monte_carlo_kl,
+    point_estimate,
+    product_of_experts,
+    sample,
+)
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.fork import BatchedForkEnv, ForkEnv, ForkSystem
-from torchrl_vjepa.heads import DeltaHead, DiagGaussianHead, Head, TargetScale
+from torchrl_vjepa.heads import (
+    DeltaHead,
+    DiagGaussianHead,
+    EnsembleHead,
+    FlowHead,
+    FullGaussianHead,
+    Head,
+    LowRankGaussianHead,
+    MixtureHead,
+    TargetScale,
+)
 from torchrl_vjepa.models import BJEPA, JEPA, VJEPA, LatentModel
 from torchrl_vjepa.noisy_tv import (
     BatchedNoisyTVEnv,
@@ -40,12 +67,17 @@ __all__ = [
     "CEM",
     "CollapseWarning",
     "Cost",
+    "CouplingFlow",
     "Delta",
     "DeltaHead",
     "DiagGaussianHead",
+    "Ensemble",
+    "EnsembleHead",
     "EnvObjective",
     "ForkEnv",
     "ForkSystem",
+    "FlowHead",
+    "FullGaussianHead",
     "FusedPredictor",
     "GaussianPrior",
     "Head",
@@ -58,7 +90,11 @@ __all__ = [
     "LatentPredictionLoss",
     "LinearGaussianSystem",
     "LinearProbe",
+    "LowRankGaussian",
+    "LowRankGaussianHead",
     "MPPI",
+    "Mixture",
+    "MixtureHead",
     "NoisyTVEnv",
     "PixelAR",
     "PixelARLoss",
@@ -79,12 +115,19 @@ __all__ = [
     "action_cost",
     "diag_gaussian",
     "effective_rank",
+    "entropy_bounds",
     "expectation",
+    "full_gaussian",
     "gaussian_entropy",
     "history_encoder",
+    "kl_divergence",
     "linear_encoder",
     "linear_probe",
+    "maximize_log_prob",
     "mlp_encoder",
+    "moments",
+    "monte_carlo_entropy",
+    "monte_carlo_kl",
     "mutual_information_bound",
     "point_estimate",
     "product_of_experts",

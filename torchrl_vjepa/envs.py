@@ -14,13 +14,13 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.distributions import Distribution, Independent, Normal
+from torch.distributions import Distribution
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_vjepa.belief import Transition, rollout
 from torchrl_vjepa.costs import Risk, StageCost, expectation
-from torchrl_vjepa.distributions import Delta, point_estimate, sample
+from torchrl_vjepa.distributions import Delta, from_noise, noise_dim, point_estimate, sample
 
 __all__ = ["LatentEnv"]
 
@@ -48,9 +48,9 @@ class LatentEnv(ModelBasedEnvBase):
         cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; the reward is minus the cost.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
         num_samples: trajectories ``M`` per candidate plan for ``how="sample"``. They share their
-            random numbers across candidates and across the batch for diagonal Gaussian predictions
-            (common random numbers: the ranking of plans does not depend on luck); other
-            distributions are sampled independently.
+            random numbers across candidates and across the batch for predictions that are transforms of
+            normal noise, those of every head (common random numbers: the ranking of plans does not
+            depend on luck); other distributions are sampled independently.
         risk: ``(costs (M, *B)) -> (*B)``, applied to the summed costs of the ``M`` trajectories.
         latent_dim: size ``D``; needed only if the model does not tell.
         latent_key: where the latent is; by default the model's, else ``"latent"``.
@@ -442,12 +442,12 @@ class _SharedNoise:
 
     def __call__(self, latent: Tensor, action: Tensor) -> Delta:
         p = self.transition(latent, action)
-        if not (isinstance(p, Independent) and isinstance(p.base_dist, Normal)):
+        size = noise_dim(p)
+        if size is None:
             return Delta(sample(p, generator=self.generator))
-        loc, scale = p.base_dist.loc, p.base_dist.scale
-        shape = (loc.shape[0], *[1] * (loc.ndim - 2), loc.shape[-1])
-        noise = torch.randn(shape, generator=self.generator, device=loc.device, dtype=loc.dtype)
-        return Delta(loc + scale * noise)
+        shape = (latent.shape[0], *[1] * (latent.ndim - 2), size)
+        noise = torch.randn(shape, generator=self.generator, device=latent.device, dtype=latent.dtype)
+        return Delta(from_noise(p, noise))
 
 
 def _first(*values: Any) -> Any:

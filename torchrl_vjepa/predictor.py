@@ -180,7 +180,7 @@ class Predictor(_Transition):
                     )
                 ]
             )
-        self.constants = nn.Parameter(torch.zeros(len(skips), self.head.num_constants(latent_dim)))
+        self.constants = nn.Parameter(self._init_constants())
         self.latent_key, self.action_key, self.side_info_key = latent_key, action_key, side_info_key
         self.in_keys = [latent_key]
         if action_dim:
@@ -190,9 +190,12 @@ class Predictor(_Transition):
         self.out_keys = [out_key]
 
     def reset_parameters(self) -> None:
-        """Set the constants of the head back to zero (the trunks reset themselves)."""
+        """New constants of the head (the trunks reset themselves)."""
         with torch.no_grad():
-            self.constants.zero_()
+            self.constants.copy_(self._init_constants())
+
+    def _init_constants(self) -> Tensor:
+        return torch.stack([self.head.init_constants(self.latent_dim) for _ in self.skips])
 
     def _reset_parameters(self, module: nn.Module) -> bool:
         # reset_parameters_recursive visits the children only, not the module that it is called on.

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
-from torch.distributions import Distribution, Independent, MultivariateNormal, kl_divergence
 
+from torchrl_vjepa.distributions import kl_divergence
 from torchrl_vjepa.models import BJEPA
 from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.objectives.vjepa import VJEPALoss
@@ -34,10 +34,14 @@ class BJEPALoss(VJEPALoss):
     Args:
         model: the model, or a list of models that train as one batch.
         structural_kl_coeff: :math:`\gamma`.
+        num_kl_samples: draws of the unbiased estimate of the divergence where there is no closed form
+            (mixtures, ensembles and flows; see
+            :func:`~torchrl_vjepa.distributions.monte_carlo_kl`), at least 2.
         **kwargs: see :class:`VJEPALoss`.
 
     Raises:
-        ValueError: if a coefficient is negative or not finite, or an option is unknown.
+        ValueError: if a coefficient is negative or not finite, ``num_kl_samples`` is below 2, or an option
+            is unknown.
 
     Examples:
         >>> import torch
@@ -60,9 +64,17 @@ class BJEPALoss(VJEPALoss):
     _parts = {**VJEPALoss._parts, "prior": "structural_prior_module"}
 
     def __init__(
-        self, model: BJEPA | Sequence[BJEPA], *, structural_kl_coeff: float = 0.1, **kwargs: Any
+        self,
+        model: BJEPA | Sequence[BJEPA],
+        *,
+        structural_kl_coeff: float = 0.1,
+        num_kl_samples: int = 8,
+        **kwargs: Any,
     ) -> None:
+        if num_kl_samples < 2:
+            raise ValueError(f"num_kl_samples must be at least 2, got {num_kl_samples}")
         super().__init__(model, **kwargs)
+        self.num_kl_samples = int(num_kl_samples)
         self._register_coeff("structural_kl_coeff", structural_kl_coeff)
 
     def _loss_keys(self) -> Iterator[str]:
@@ -84,17 +96,10 @@ class BJEPALoss(VJEPALoss):
         terms = super()._member_terms(pairs, target_latent, data, mask, params)
         with params["prior"].to_module(self.prior):
             prior = self.prior.module()
-            kls = [_kl(pair.dist, prior) for pair in pairs]
+            kls = [kl_divergence(pair.dist, prior, num_samples=self.num_kl_samples) for pair in pairs]
         terms["loss_structural_kl"] = self.structural_kl_coeff * self._reduce_pairs(kls, pairs)
         if self.reduction != "none":
             means = [pair.mean(kl) for pair, kl in zip(pairs, kls, strict=True)]
             weighted = [w * mean for w, mean in zip(self.skip_weights, means, strict=True)]
             terms["structural_kl"] = torch.stack(weighted).sum().detach()
         return terms
-
-
-def _kl(p: Distribution, prior: Distribution) -> Tensor:
-    if isinstance(prior, MultivariateNormal) and isinstance(p, Independent):
-        # torch has no divergence between a diagonal and a full Gaussian.
-        p = MultivariateNormal(p.mean, scale_tril=torch.diag_embed(p.stddev), validate_args=False)
-    return kl_divergence(p, prior.expand(p.batch_shape))

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
-from torchrl_vjepa.distributions import diag_gaussian
+from torchrl_vjepa.distributions import diag_gaussian, log_score
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.objectives.base import LatentPredictionLoss
 from torchrl_vjepa.objectives.pairs import Pairs
@@ -49,7 +49,8 @@ class VJEPALoss(LatentPredictionLoss):
         target_kl_coeff: :math:`\beta`.
         target_scale_gradient: what moves the scale of the target: ``"kl"``: the KL term alone (the
             paper's training section); ``"both"``: the likelihood too; ``"none"``: it stays as it is.
-        residual_variance: ``"head"``: the likelihood is the head's, as printed; ``"batch"``: the
+        residual_variance: ``"head"``: the likelihood is the head's, as printed (an ensemble's members
+            each have their own, :func:`~torchrl_vjepa.distributions.log_score`); ``"batch"``: the
             representation and the mean are trained by the likelihood at the residual covariance that is
             optimal for the batch, in closed form, :math:`\hat\Sigma = \mathbb E\, r r^\top` with
             :math:`r = Z_T - \mu_\phi`, and the head by its own likelihood on detached latents
@@ -171,13 +172,16 @@ class VJEPALoss(LatentPredictionLoss):
     ) -> dict[str, Tensor]:
         terms = {}
         if self.residual_variance == "head":
-            nlls = head_nlls = [-pair.dist.log_prob(pair.target) for pair in pairs]
+            nlls = head_nlls = [-log_score(pair.dist, pair.target) for pair in pairs]
         else:
             nlls = [self._profile_nll(pair) for pair in pairs]
             head_nlls = [
-                -self.predictor.dist(
-                    pair.context.detach(), pair.action, skip=pair.skip, side_info=pair.side_info
-                ).log_prob(pair.target.detach())
+                -log_score(
+                    self.predictor.dist(
+                        pair.context.detach(), pair.action, skip=pair.skip, side_info=pair.side_info
+                    ),
+                    pair.target.detach(),
+                )
                 for pair in pairs
             ]
             terms["loss_head"] = self._reduce_pairs(head_nlls, pairs)
