@@ -362,7 +362,9 @@ def figure(drawn: dict[str, Shown], path: Path) -> None:
         2, len(drawn), figsize=(2.6 * len(drawn), 5.0), sharex=True, sharey=True, layout="constrained"
     )
     position, action = torch.tensor([-2.0, 0.4]), torch.tensor([-0.3])
-    along, across = torch.meshgrid(torch.linspace(-2, 1, 151), torch.linspace(-2, 2, 201), indexing="ij")
+    along, across = torch.meshgrid(
+        torch.linspace(-5.2, 3.8, 451), torch.linspace(-2.6, 2.6, 261), indexing="ij"
+    )
     points = torch.stack([along, across], dim=-1)
     for (head, shown), density, roads in zip(drawn.items(), axes[0], axes[1], strict=True):
         with torch.no_grad():
@@ -384,7 +386,7 @@ def figure(drawn: dict[str, Shown], path: Path) -> None:
         roads.set_xlabel("along the road (units)")
         for ax in (density, roads):
             draw_wall(ax, system)
-    axes[0, 0].set(xlim=(-5.2, 3.8), ylim=(-2.3, 2.3), ylabel="across (units)")
+    axes[0, 0].set(xlim=(-5.2, 3.8), ylim=(-2.6, 2.6), ylabel="across (units)")
     axes[1, 0].set_ylabel("across (units)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     more_handles, more_labels = axes[1, 0].get_legend_handles_labels()
