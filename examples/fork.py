@@ -86,7 +86,7 @@ class Settings:
     train_steps: int = option(1_000, "optimiser steps")
     batch_size: int = option(256, "transitions in a batch")
     lr: float = option(0.01, "peak learning rate (one cycle)")
-    encoder_lr: float = option(0.001, "the same of the encoder, which all predictions are made of")
+    encoder_lr: float = option(0.001, "the same of the encoder, slower: all predictions rest on it")
     num_cells: int = option(128, "width of the two hidden layers of the predictor")
     ema_decay: float = option(0.99, "tau of the target encoder")
     target_std: float = option(0.003, "standard deviation of the target distribution, in latent units")
@@ -152,11 +152,11 @@ def train(head: str, data: TensorDict, seed: int, settings: Settings) -> VJEPA:
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(data)), batch_size=settings.batch_size)
     buffer.set_rng(torch.Generator().manual_seed(seed))
     buffer.extend(data)
-    encoder = list(loss.encoder_params.parameters())
-    others = [p for p in loss.parameters() if all(p is not q for q in encoder)]
+    slow = list(loss.encoder_params.parameters())
+    others = [p for p in loss.parameters() if all(p is not q for q in slow)]
     rates = [settings.encoder_lr, settings.lr]
     optimizer = torch.optim.Adam(
-        [{"params": group, "lr": rate} for group, rate in zip((encoder, others), rates, strict=True)],
+        [{"params": group, "lr": rate} for group, rate in zip((slow, others), rates, strict=True)],
         fused=True,
     )
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -183,7 +183,7 @@ class Belief:
 
     @classmethod
     def of(cls, model: VJEPA) -> Belief:
-        """The encoder's matrix and offset, read off four points."""
+        """The encoder's matrix and offset, read off three points."""
         points = torch.cat([torch.zeros(1, 2), torch.eye(2)])
         with torch.no_grad():
             images = model.encoder(TensorDict(observation=points, batch_size=[3]))["latent"]
