@@ -386,8 +386,8 @@ def figure(drawn: dict[str, Shown], path: Path) -> None:
         roads.set_xlabel("along the road (units)")
         for ax in (density, roads):
             draw_wall(ax, system)
-    axes[0, 0].set(xlim=(-5.2, 3.8), ylim=(-2.6, 2.6), ylabel="across (units)")
-    axes[1, 0].set_ylabel("across (units)")
+    axes[0, 0].set(xlim=(-5.2, 3.8), ylim=(-2.6, 2.6), ylabel="across (units)\n\npredicted density")
+    axes[1, 0].set_ylabel(f"across (units)\n\n{NUM_DRAWN} episodes")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     more_handles, more_labels = axes[1, 0].get_legend_handles_labels()
     wall = Rectangle((0, 0), 1, 1, fc="none", ec="0.3", lw=0.8, hatch="////")

@@ -177,10 +177,7 @@ def test_strata_make_the_gradient_of_a_mixture_exact_in_expectation() -> None:
     logits = torch.tensor([0.3, -0.2], dtype=torch.float64, requires_grad=True)
     loc = torch.tensor([[-1.0], [0.8]], dtype=torch.float64, requires_grad=True)
     scale = torch.tensor([[0.5], [0.9]], dtype=torch.float64, requires_grad=True)
-    p, q = (
-        Mixture(logits, diag_gaussian(loc, scale)),
-        diag_gaussian(torch.zeros(1).double(), torch.ones(1).double()),
-    )
+    q = diag_gaussian(torch.zeros(1).double(), torch.ones(1).double())
     grid = torch.linspace(-12, 12, 4001, dtype=torch.float64).unsqueeze(-1)
     log_p = Mixture(logits, diag_gaussian(loc, scale)).log_prob(grid)
     exact = (log_p.exp() * (log_p - q.log_prob(grid))).sum() * (grid[1, 0] - grid[0, 0])

@@ -30,13 +30,16 @@ from torchrl_vjepa import (
     LowRankGaussianHead,
     MixtureHead,
     Predictor,
+    TargetScale,
     VJEPALoss,
     linear_encoder,
     moments,
     point_estimate,
     quadratic_cost,
     rollout,
+    sample,
 )
+from torchrl_vjepa.distributions import log_score
 
 OBS, LATENT, ACTION = 6, 3, 2
 HEADS: dict[str, Callable[[], Head]] = {
@@ -95,6 +98,22 @@ def test_the_likelihood_falls_in_training(name: str, residual_variance: Any) -> 
     assert sum(history[-5:]) < sum(history[:5])
     out = model(data[:, 0])
     assert out["loc"].shape == out["scale"].shape == (4, LATENT)
+
+
+def test_members_of_an_ensemble_train_by_their_own_likelihoods() -> None:
+    predictor = Predictor(LATENT, ACTION, head=HEADS["ensemble"]())
+    scale = TargetScale(LATENT, kind="constant", init_std=1e-3)
+    model = VJEPA(linear_encoder(OBS, LATENT), predictor, target_scale=scale)
+    data = windows()
+    with torch.no_grad():
+        z = model.encoder(data.clone())["latent"]
+        p = predictor.dist(z[:, :-1], data["action"][:, :-1])
+        own, mixed = log_score(p, z[:, 1:]).mean(), p.log_prob(z[:, 1:]).mean()
+    for residual_variance in ("head", "batch"):
+        loss = VJEPALoss(model, residual_variance=residual_variance)
+        SoftUpdate(loss, eps=0.99)
+        found = -loss(data)["nll_skip_1"]
+        assert abs(float(found - own)) < 0.1 * float(mixed - own)
 
 
 @EVERY
@@ -202,8 +221,6 @@ def test_rollouts_of_a_generator_are_deterministic(name: str) -> None:
 
 def fit(head: Head, x: Tensor, y: Tensor, steps: int, lr: float = 1e-2, trunk: Any = "linear") -> Predictor:
     """Maximum likelihood of the head's own kind, full batch."""
-    from torchrl_vjepa.distributions import log_score
-
     predictor = Predictor(x.shape[-1], head=head, trunk=trunk, num_cells=[16], bias=True)
     optimizer = torch.optim.Adam(predictor.parameters(), lr=lr)
     for _ in range(steps):
@@ -234,47 +251,44 @@ def test_heads_rank_by_what_they_can_express_on_a_fork() -> None:
         "flow": FlowHead(2, 16),
     }
     for name, head in heads.items():
-        p = fit(head, x, y, 300 if name == "flow" else 200, 2e-2).dist(test_x)
-        score[name] = float(p.log_prob(test_y).mean())
+        predictor = fit(head, x, y, 200, 2e-2)
         with torch.no_grad():
-            wall[name] = float(((p.sample((20,)) - test_x)[..., 0].abs() < 1).float().mean())
+            p = predictor.dist(test_x)
+            score[name] = float(p.log_prob(test_y).mean())
+            drawn = sample(p, (20,), generator=torch.Generator().manual_seed(0)) - test_x
+        wall[name] = float((drawn[..., 0].abs() < 1).float().mean())
+        if name == "mixture":  # the mean lies in the wall, the mode at one of the exits
+            assert ((p.mean - test_x)[..., 0].abs() < 1).float().mean() > 0.95
+            assert ((point_estimate(p, "mode") - test_x)[..., 0].abs() > 1.5).float().mean() > 0.95
+    assert score["diagonal"] < score["full"] - 0.3
+    assert score["full"] < min(score["mixture"], score["flow"]) - 0.3
+    # Minus the entropy of the truth is the best that anything can reach.
     entropy = 2 * (0.5 * math.log(2 * math.pi * math.e) + math.log(0.2)) + math.log(2)
-    assert score["diagonal"] < score["full"] - 0.3 < score["flow"] - 0.6
-    assert abs(score["mixture"] + entropy) < 0.1
-    assert score["flow"] > -entropy - 0.4
-    assert wall["mixture"] < 0.01
+    assert -entropy - 0.5 < score["mixture"] < -entropy + 0.1
+    assert wall["mixture"] < 0.05
     assert wall["flow"] < 0.05
     assert wall["diagonal"] > 0.2
-    # The mean lies in the wall, the mode at one of the exits.
-    p = fit(MixtureHead(2), x, y, 200, 2e-2).dist(test_x[:50])
-    assert ((point_estimate(p, "mean") - test_x[:50])[..., 0].abs() < 0.5).all()
-    assert ((point_estimate(p, "mode") - test_x[:50])[..., 0].abs() > 1.7).all()
 
 
 def test_an_ensemble_knows_what_it_has_not_seen() -> None:
-    """The paper's remark on ensembles, measured: disagreement is ignorance, the members' variance is noise."""
-    generator = torch.Generator().manual_seed(0)
-
-    def data(num: int) -> tuple[Tensor, Tensor]:
-        x = 2 * torch.rand(num, 1, generator=generator) - 1
-        return x, torch.sin(3 * x) + 0.1 * torch.randn(num, 1, generator=generator)
-
+    """The paper's remark on ensembles, measured: disagreement is ignorance, members' variance is noise."""
     inside, outside = torch.linspace(-0.9, 0.9, 50).unsqueeze(-1), torch.tensor([[-4.0], [4.0]])
     epistemic, aleatoric, far = {}, {}, {}
     for num in (8, 64, 512):
-        head = EnsembleHead(DiagGaussianHead("constant", log_var_range=(-8.0, 4.0)), 8, 32)
-        with torch.no_grad():
-            x, y = data(num)
-        predictor = fit(head, x, y, 300)
+        generator = torch.Generator().manual_seed(num)
+        x = 2 * torch.rand(num, 1, generator=generator) - 1
+        y = torch.sin(3 * x) + 0.1 * torch.randn(num, 1, generator=generator)
+        head = EnsembleHead(DiagGaussianHead("constant", log_var_range=(-8.0, 4.0)), 5, 32)
+        predictor = fit(head, x, y, 500, 2e-2)
         with torch.no_grad():
             p, q = predictor.dist(inside), predictor.dist(outside)
         epistemic[num] = float(p.epistemic_variance.mean())
         aleatoric[num] = float(p.aleatoric_variance.mean())
         far[num] = float(q.epistemic_variance.mean())
-    # It grows away from the data, at any number of them.
-    assert all(far[num] > 20 * epistemic[num] for num in far)
+    # It grows away from the data, however many there are.
+    assert all(far[num] > 1000 * epistemic[num] for num in far)
     # It falls with data, and what is noise stays.
-    assert epistemic[512] < 0.3 * epistemic[8]
-    assert epistemic[512] < 0.2 * aleatoric[512]
+    assert epistemic[512] < 0.5 * epistemic[8]
+    assert epistemic[512] < 0.05 * aleatoric[512]
     assert abs(math.log(aleatoric[512] / 0.1**2)) < 0.3
     assert abs(math.log(aleatoric[512] / aleatoric[64])) < 0.5

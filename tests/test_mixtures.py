@@ -171,6 +171,19 @@ def test_gradients_far_out_in_the_tails_are_finite_and_right(dtype: torch.dtype)
         )
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_gradients_of_weights_keep_their_digits_in_both_tails(side: float) -> None:
+    """Five standard deviations out, 1 minus the distribution function has no digits left in float32."""
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        logits = torch.zeros(2, dtype=dtype, requires_grad=True)
+        loc = torch.tensor([[-0.5, 0.0], [0.5, 0.3]], dtype=dtype)
+        p = Mixture(logits, diag_gaussian(loc, torch.ones(2, dtype=dtype)))
+        z = p.from_noise(side * torch.tensor([5.0, 5.0, -0.5], dtype=dtype))
+        found.append(torch.autograd.grad(z.sum(), logits)[0].double())
+    torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=0)
+
+
 def test_components_without_densities_in_closed_form_have_no_gradient() -> None:
     loc = torch.randn(2, D, requires_grad=True)
     p = Mixture(torch.zeros(2), full_gaussian(loc, torch.eye(D)))

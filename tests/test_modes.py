@@ -84,11 +84,12 @@ def test_the_result_is_never_worse_than_a_start() -> None:
     torch.testing.assert_close(none[1], p.log_prob(starts).amax(0))
 
 
-def test_a_start_that_goes_astray_stops_no_other() -> None:
+@pytest.mark.parametrize("name", ["default", "LBFGS"])
+def test_a_start_that_goes_astray_stops_no_other(name: str) -> None:
     def walled(z: Tensor) -> Tensor:
         return torch.where(z > 5, torch.nan, -(z - 1).square()).sum(-1)
 
-    point, value = maximize_log_prob(walled, torch.tensor([[[9.0]], [[0.0]]]))
+    point, value = maximize_log_prob(walled, torch.tensor([[[9.0]], [[0.0]]]), optimizer=OPTIMIZERS[name])
     torch.testing.assert_close(point, torch.ones(1, 1), rtol=0, atol=0.02)
     assert value.isfinite().all()
 

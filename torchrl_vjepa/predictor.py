@@ -285,10 +285,12 @@ class FusedPredictor(_Transition):
     r"""Hard fusion of the dynamics with a prior by product of experts (``eq:bjepa_posterior``).
 
     :math:`p(Z_T \mid Z_C, \eta) \propto p_{\text{like}}(Z_T \mid Z_C)\, p_{\text{prior}}(Z_T \mid \eta)`,
-    in closed form for Gaussians. It is again a transition, with the attributes of the predictor.
+    in closed form for Gaussians, also of mixtures of them. It is again a transition, with the attributes
+    of the predictor.
 
     Args:
-        predictor: the likelihood expert :math:`p_{\text{like}}`, with a Gaussian head.
+        predictor: the likelihood expert :math:`p_{\text{like}}`, with a head that is Gaussian, a mixture
+            or an ensemble of Gaussians.
         prior: the prior expert: a callable that returns a Gaussian over latents, for instance a
             :class:`~torchrl_vjepa.priors.GaussianPrior`. ``None`` is the flat prior: the predictor's own
             distribution.

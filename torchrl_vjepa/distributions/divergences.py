@@ -251,7 +251,7 @@ def _root(p: Distribution) -> Tensor:
         return torch.diag_embed(full_precision(p.stddev)[0])
     if isinstance(p, MultivariateNormal):
         return full_precision(p._unbroadcasted_scale_tril)[0]
-    factor, scale = _factor_and_scale(p)
+    factor, scale = full_precision(_low_rank(p).factor, _low_rank(p).scale)
     return torch.cat([factor, torch.diag_embed(scale).expand(*factor.shape[:-1], -1)], dim=-1)
 
 
@@ -265,11 +265,10 @@ def _inverse_norm(q: Distribution, columns: Tensor) -> Tensor:
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
         inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
         return (inverse @ columns).square().sum((-1, -2))
-    factor, scale = _factor_and_scale(q)
-    whitened = factor / scale.unsqueeze(-1)
-    columns = columns / scale.unsqueeze(-1)
-    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
-    capacitance = torch.linalg.cholesky(eye + whitened.mT @ whitened)
+    low_rank = _low_rank(q)
+    whitened, capacitance = low_rank.whitened()
+    columns = columns / full_precision(low_rank.scale)[0].unsqueeze(-1)
+    eye = torch.eye(capacitance.shape[-1], dtype=capacitance.dtype, device=capacitance.device)
     inverse = torch.linalg.solve_triangular(capacitance, eye, upper=False)
     explained = (inverse @ (whitened.mT @ columns)).square().sum((-1, -2))
     return columns.square().sum((-1, -2)) - explained
@@ -280,15 +279,14 @@ def _log_det(p: Distribution) -> Tensor:
         return 2 * full_precision(p.stddev)[0].log().sum(-1)
     if isinstance(p, MultivariateNormal):
         return 2 * full_precision(p._unbroadcasted_scale_tril)[0].diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return LowRankGaussian(p.mean, *_factor_and_scale(p)).log_det()
+    return _low_rank(p).log_det()
 
 
-def _factor_and_scale(p: Any) -> tuple[Tensor, Tensor]:
+def _low_rank(p: Any) -> LowRankGaussian:
+    """What is neither diagonal nor full: of this package's class, or torch's."""
     if isinstance(p, LowRankGaussian):
-        factor, scale = full_precision(p.factor, p.scale)
-    else:
-        factor, scale = full_precision(p._unbroadcasted_cov_factor, p._unbroadcasted_cov_diag.sqrt())
-    return factor, scale
+        return p
+    return LowRankGaussian(p.loc, p._unbroadcasted_cov_factor, p._unbroadcasted_cov_diag.sqrt())
 
 
 def _is_diagonal(p: Distribution) -> bool:

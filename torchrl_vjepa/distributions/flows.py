@@ -145,11 +145,9 @@ class CouplingFlow(NoiseDistribution):
 
         Its gradient is that of the transform at fixed noise.
         """
-        starts, _, _ = self.search_space()
         with torch.no_grad():
-            point, _ = maximize_log_prob(self)
-            noise, _ = self.to_noise(point)
-        return self.from_noise(noise.to(starts.dtype))
+            noise, _ = self.to_noise(maximize_log_prob(self, num_steps=50)[0])
+        return self.from_noise(noise)
 
     def to_noise(self, value: Tensor) -> tuple[Tensor, Tensor]:
         r"""The inverse, :math:`\epsilon = T^{-1}(Z)`.
@@ -192,15 +190,18 @@ class CouplingFlow(NoiseDistribution):
         return log_det - 0.5 * (noise.square().sum(-1) + noise.shape[-1] * math.log(2 * math.pi))
 
     def search_space(self) -> SearchSpace:
-        """Starts at the centre of the noise and at 16 of the fixed points.
+        """Starts at the four most probable of 65 fixed points, in the space of the noise.
 
         Returns:
-            Starts ``(17, *B, D)`` and the transform, from noise to latents.
+            Starts ``(4, *B, D)`` and the transform, from noise to latents.
         """
-        points = normal_points(16, self.event_shape[0]).to(self.loc)
-        starts = torch.cat([torch.zeros_like(points[:1]), points[:16]])
-        starts = starts.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0])
-        starts = starts.expand(-1, *self.batch_shape, -1).contiguous()
+        points = normal_points(64, self.event_shape[0]).to(self.loc)
+        points = torch.cat([torch.zeros_like(points[:1]), points])
+        points = points.reshape(-1, *[1] * len(self.batch_shape), self.event_shape[0])
+        points = points.expand(-1, *self.batch_shape, -1)
+        with torch.no_grad():
+            best = self.log_prob(self.from_noise(points)).topk(4, dim=0).indices
+        starts = torch.take_along_dim(points, best.unsqueeze(-1), 0)
         return starts, self.from_noise, torch.ones_like(self.loc)
 
     def expand(self, batch_shape: Sequence[int], _instance: Distribution | None = None) -> CouplingFlow:

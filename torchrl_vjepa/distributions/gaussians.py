@@ -174,7 +174,9 @@ class LowRankGaussian(NoiseDistribution):
         factor, scale = full_precision(self.factor, self.scale)
         whitened = factor / scale.unsqueeze(-1)
         eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
-        return whitened, torch.linalg.cholesky(eye + whitened.mT @ whitened)
+        # It cannot fail but by NaN, which stays NaN: the error of cholesky() would stop every other model
+        # that trains in the same batch, and makes a GPU wait.
+        return whitened, torch.linalg.cholesky_ex(eye + whitened.mT @ whitened).L
 
     def log_det(self) -> Tensor:
         """Logarithm of the covariance's determinant.

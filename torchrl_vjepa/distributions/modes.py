@@ -31,8 +31,7 @@ def maximize_log_prob(
     The paper's MAP prediction (section "Prediction and Uncertainty Propagation"), and its latent MAP
     under a prior: ``target`` may be any log-density up to a constant, for instance that of a likelihood
     times an energy prior. All starts of all batch rows ascend together; the best point that was ever
-    visited wins, so the result is never worse than a start. The step is in units of ``scale``, and is
-    reduced to zero along a half cosine.
+    visited wins, so the result is never worse than a start. The step is in units of ``scale``.
 
     Args:
         target: a distribution with batch ``*B`` and event ``(D,)``, or a log-density
@@ -121,11 +120,9 @@ def _ascend(
         return -objective.detach()
 
     optimizer = torch.optim.Adam([steps], lr=0.1) if make_optimizer is None else make_optimizer([steps])
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(num_steps, 1))
     for _ in range(num_steps):
         # LBFGS's types want floats where tensors do.
         optimizer.step(closure)  # type: ignore[arg-type]
-        schedule.step()
     closure()
     return record["value"], record["point"]
 
