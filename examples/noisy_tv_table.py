@@ -122,7 +122,15 @@ class Settings:
     workers: int = option(2, "processes; each trains with one thread")
 
 
-QUICK = {"noise_scales": [0.0, 8.0], "restarts": 3, "workers": 1}
+QUICK = {
+    "noise_scales": [0.0, 8.0],
+    "train_length": 1000,
+    "test_length": 300,
+    "steps": 60,
+    "restarts": 3,
+    "heat_steps": 15,
+    "workers": 1,
+}
 
 
 @dataclass
