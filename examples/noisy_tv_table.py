@@ -123,6 +123,31 @@ class Settings:
     heat_steps: int = option(75, "robust: optimiser steps of the first round, which all starts train")
     skips: list[int] = option([1, 8, 16], "robust: prediction steps that are learned together")
     skip_weights: list[float] = option([0.04, 0.48, 0.48], "robust: their weights")
+    normalisation: str = option(
+        "whitening",
+        "robust: whitening, or standard scores of each component as in the paper",
+        choices=["whitening", "standard"],
+    )
+    entropy: str = option(
+        "moments",
+        "robust: the entropy term of the bound: of the moments, of random projections (SIGReg), or none",
+        choices=["moments", "sliced", "none"],
+    )
+    entropy_coeff: float = option(0.0, "robust: its weight; 0 is 1 (moments) or 10 (sliced)")
+    residual_variance: str = option(
+        "batch",
+        "robust, VJEPA and BJEPA: the closed form of the batch, or what the head has learned",
+        choices=["batch", "head"],
+    )
+    target_scale: str = option(
+        "constant",
+        "robust, VJEPA and BJEPA: constant (0.01), or learned by the KL term as in the paper",
+        choices=["constant", "learned"],
+    )
+    schedule: str = option(
+        "one-cycle", "robust: of the learning rate, in each round", choices=["one-cycle", "constant"]
+    )
+    ema_decay: float = option(0.9, "robust: decay of the EMA target encoder")
     window: int = option(20, "robust: steps in a window, more than the largest skip")
     windows: int = option(24, "robust: windows in a batch")
     lr: float = option(0.0, "peak learning rate; 0 is 0.001 (paper) or 0.3 (robust)")
@@ -168,10 +193,10 @@ class Run:
             for scale in settings.noise_scales
         ]
 
-    def normalise(self, preset: str) -> tuple[Tensor, Tensor]:
+    def normalise(self, normalisation: str) -> tuple[Tensor, Tensor]:
         """Training and test observations, centred and scaled by statistics of the training ones."""
         train, test = self.train["observation"], self.test["observation"]
-        if preset == "paper":
+        if normalisation == "standard":
             mean, std = train.mean(0), train.std(0)
             return (train - mean) / std, (test - mean) / std
         whitening = Whitening(self.system.observation_dim)
@@ -243,23 +268,24 @@ def robust_model(name: str, settings: Settings) -> Any:
     if name == "JEPA":
         return JEPA(encoder, predictor)
     model = {"VJEPA": VJEPA, "BJEPA": BJEPA}[name]
-    target_scale = TargetScale(latent_dim, kind="constant", init_std=0.01)
+    target_scale = TargetScale(latent_dim, kind=settings.target_scale, init_std=0.01)
     return model(encoder, predictor, target_scale=target_scale)
 
 
 def robust_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowLoss:
     """The mutual information bound: predict well, keep the entropy."""
-    common = {
-        "stacked_data": True,
-        "skip_weights": settings.skip_weights,
-        "marginal_entropy_coeff": 1.0,
-        "collapse_rank": 0.0,
-    }
+    common = {"stacked_data": True, "skip_weights": settings.skip_weights, "collapse_rank": 0.0}
+    if settings.entropy == "moments":
+        common["marginal_entropy_coeff"] = settings.entropy_coeff or 1.0
+    elif settings.entropy == "sliced":
+        common["sliced_entropy_coeff"] = settings.entropy_coeff or 10.0
     if name == "JEPA":
         # The likelihood of a residual variance of 1/8. That of 1 tells a predictable direction from another
         # so weakly that the noise of the batches stays in the encoder.
         return JEPALoss(models, prediction_coeff=4.0, **common)
-    common |= {"target_kl_coeff": 0.0, "residual_variance": "batch"}
+    # A constant scale has nothing to learn from the KL term.
+    common["target_kl_coeff"] = BETA if settings.target_scale == "learned" else 0.0
+    common["residual_variance"] = settings.residual_variance
     if name == "VJEPA":
         return VJEPALoss(models, **common)
     return BJEPALoss(models, structural_kl_coeff=GAMMA, **common)
@@ -311,7 +337,7 @@ def same_moments(observations: Tensor) -> Tensor:
 
 def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[Any]:
     """Full-batch Adam at a constant learning rate; one model for each run."""
-    observations = torch.stack([run.normalise("paper")[0] for run in runs])
+    observations = torch.stack([run.normalise("standard")[0] for run in runs])
     if settings.encoder == "linear" and name in ("AR", "JEPA"):
         windows = same_moments(observations)
     else:
@@ -335,7 +361,7 @@ def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[
 
 def train_robust(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[Any]:
     """Two rounds: all starts of a run train a little, the best few train on; the objective chooses."""
-    observations = torch.stack([run.normalise("robust")[0] for run in runs])
+    observations = torch.stack([run.normalise(settings.normalisation)[0] for run in runs])
     models = make_models(robust_model, name, runs, settings.restarts, settings)
     rounds = [(settings.heat_steps, settings.finalists), (settings.steps or 100, 1)]
     for steps, keep in rounds:
@@ -348,7 +374,7 @@ def train_robust(name: str, runs: Sequence[Run], settings: Settings) -> Iterator
 
 def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Settings) -> Tensor:
     """One cycle of a large learning rate on minibatches; the score of each start, a row for each run."""
-    updater = SoftUpdate(loss, eps=0.9)
+    updater = SoftUpdate(loss, eps=settings.ema_decay)
     lr = settings.lr or 0.3
     mlp = [param for key, param in loss.named_parameters() if "mlp" in key]
     rest = [param for key, param in loss.named_parameters() if "mlp" not in key]
@@ -356,9 +382,13 @@ def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Set
     if mlp:
         groups.append({"params": mlp, "lr": 0.1 * lr, "weight_decay": 1.0})
     optimizer = torch.optim.AdamW(groups, betas=(0.8, 0.99), fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, [group["lr"] for group in groups], total_steps=steps, pct_start=0.2, cycle_momentum=False
-    )
+    if settings.schedule == "constant":
+        schedule = torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
+    else:
+        peaks = [group["lr"] for group in groups]
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, peaks, total_steps=steps, pct_start=0.2, cycle_momentum=False
+        )
     starts_of_a_run = loss.num_models // len(observations)
     select_objective(loss)
 
@@ -442,13 +472,14 @@ def run_task(task: tuple[str, str, int], settings: Settings) -> tuple[list[Row],
     preset, name, seed = task
     torch.set_num_threads(1)
     runs = Run.simulate(seed, settings)
+    normalisation = "standard" if preset == "paper" else settings.normalisation
     start = time.perf_counter()
     train = train_paper if preset == "paper" else train_robust
     models = list(train(name, runs, settings))
     seconds = (time.perf_counter() - start) / len(runs)
     rows, shown = [], {}
     for run, model in zip(runs, models, strict=True):
-        outputs = [represent(name, model, observations) for observations in run.normalise(preset)]
+        outputs = [represent(name, model, observations) for observations in run.normalise(normalisation)]
         scores, predicted = probe(
             [latent for latent, _ in outputs], run, 0 if name == "VAE" else 1, settings.r2
         )
@@ -657,6 +688,10 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Na
     settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
     if settings.preset == ["robust"] and not set(settings.models) & set(LATENT_MODELS):
         parser.error("VAE and AR have the preset paper only")
+    if settings.entropy == "none" and settings.entropy_coeff:
+        parser.error(f"--entropy none has no weight, got --entropy-coeff {settings.entropy_coeff:g}")
+    if "robust" in settings.preset and min(settings.heat_steps, settings.steps or 100) < 6:
+        parser.error("--heat-steps and --steps must be at least 6 with the preset robust: a cycle needs them")
     return settings, args
 
 

@@ -10,6 +10,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -362,15 +363,21 @@ def table_settings(module: Any, **changes: Any) -> Any:
     return module.Settings(**{**small, **race, "sizes": [2, 2, 6], **changes})
 
 
-@pytest.fixture(scope="module")
-def table() -> Any:
-    """The script as a module."""
-    spec = importlib.util.spec_from_file_location("noisy_tv_table", ROOT / "examples/noisy_tv_table.py")
+def load_module(path: str) -> Any:
+    """A script as a module."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def table() -> Any:
+    """The script as a module."""
+    module = load_module("examples/noisy_tv_table.py")
     yield module
-    del sys.modules[spec.name]
+    del sys.modules["noisy_tv_table"]
 
 
 @pytest.mark.parametrize("encoder", ["linear", "mlp"])
@@ -425,7 +432,7 @@ def test_every_start_of_a_race_trains(table: Any, encoder: str) -> None:
     (run,) = table.Run.simulate(0, settings)
     before = table.make_models(table.robust_model, "VJEPA", [run], 2, settings)
     models = table.make_models(table.robust_model, "VJEPA", [run], 2, settings)
-    observations = run.normalise("robust")[0].unsqueeze(0)
+    observations = run.normalise("whitening")[0].unsqueeze(0)
     for _ in range(2):
         loss = table.robust_loss("VJEPA", models, settings)
         scores = table.fit_robust(loss, observations, 4, settings)
@@ -441,7 +448,7 @@ def test_every_start_of_a_race_trains(table: Any, encoder: str) -> None:
 def test_few_pairs_give_the_losses_and_gradients_of_all(table: Any, name: str) -> None:
     settings = table_settings(table, noise_scales=[0.0, 8.0])
     runs = table.Run.simulate(0, settings)
-    observations = torch.stack([run.normalise("paper")[0] for run in runs]).double()
+    observations = torch.stack([run.normalise("standard")[0] for run in runs]).double()
     few = table.same_moments(observations)
     everything = torch.stack([observations[:, :-1], observations[:, 1:]], dim=2)
     assert few.shape == (2, 13, 2, 6)
@@ -492,11 +499,59 @@ def test_cca_finds_the_signal_without_labels(table: Any) -> None:
     assert min(scores.values()) > 0.98
 
 
-@pytest.mark.parametrize("wrong", [["--models", "PCA"], ["--preset", "robust", "--models", "VAE"]])
-def test_the_table_refuses(table: Any, wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"normalisation": "standard"},
+        {"entropy": "none"},
+        {"entropy": "sliced"},
+        {"entropy_coeff": 0.5},
+        {"residual_variance": "head"},
+        {"target_scale": "learned"},
+        {"schedule": "constant"},
+        {"ema_decay": 0.99},
+        {"skip_weights": [1.0, 1.0, 1.0]},
+        {"finalists": 1, "restarts": 1},
+        {"lr": 0.1},
+    ],
+    ids=str,
+)
+def test_every_ingredient_of_the_robust_recipe_can_be_changed(table: Any, change: dict[str, Any]) -> None:
+    (full,), _ = table.run_task(("robust", "VJEPA", 0), table_settings(table))
+    (changed,), _ = table.run_task(("robust", "VJEPA", 0), table_settings(table, **change))
+    assert math.isfinite(changed["signal_r2"])
+    assert changed["signal_r2"] != full["signal_r2"]
+
+
+def test_the_ablations_change_one_recipe() -> None:
+    ablations = load_module("benchmarks/ablations.py")
+    script = ablations.load_script()
+    full = script.Settings()
+    for variant, changes in ablations.VARIANTS.items():
+        assert (vars(replace(full, **changes)) == vars(full)) == (variant == "full recipe")
+    row = {"model": "VJEPA", "variant": "full recipe", "signal_r2": 1.0, "noise_r2": None, "train_s": 1.0}
+    other = {**row, "signal_r2": 0.5, "noise_r2": 0.25}
+    cells = ablations.table([row, other]).splitlines()[-1].split()
+    assert cells == ["VJEPA", "full", "recipe", "0.7500", "0.5000", "50%", "0.2500", "1.00"]
+    assert ablations.applies("VJEPA", "variance of the head")
+    assert not ablations.applies("JEPA", "variance of the head")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--models", "PCA"], "VAE"),
+        (["--preset", "robust", "--models", "VAE"], "VAE"),
+        (["--entropy", "none", "--entropy-coeff", "1"], "no weight"),
+        (["--heat-steps", "5"], "at least 6"),
+    ],
+)
+def test_the_table_refuses(
+    table: Any, wrong: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         table.parse(wrong)
-    assert "VAE" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_report_with_nan_is_refused(tmp_path: Path) -> None:
