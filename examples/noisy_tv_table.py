@@ -66,6 +66,15 @@ COLORS = {
     "BJEPA": "#CC79A7",
     "Kalman filter": "black",
 }
+# Nested where the curves of the models coincide.
+MARKERS: dict[str, dict[str, Any]] = {
+    "VAE": {"marker": "^", "ms": 5},
+    "AR": {"marker": "v", "ms": 5},
+    "JEPA": {"marker": "o", "ms": 10, "mfc": "none"},
+    "VJEPA": {"marker": "s", "ms": 6, "mfc": "none"},
+    "BJEPA": {"marker": "D", "ms": 2.5},
+    "Kalman filter": {},
+}
 # The paper's table (seed 111): test R2 of signal and noise at the scales 0, 1, ..., 8.
 PAPER_SIGNAL = {
     "VAE": [1.000, 0.973, 0.853, 0.770, 0.730, 0.681, 0.627, 0.566, 0.499],
@@ -278,7 +287,8 @@ def robust_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowL
     if settings.entropy == "moments":
         common["marginal_entropy_coeff"] = settings.entropy_coeff or 1.0
     elif settings.entropy == "sliced":
-        common["sliced_entropy_coeff"] = settings.entropy_coeff or 10.0
+        # A few directions are enough for a small latent: each step draws others.
+        common |= {"sliced_entropy_coeff": settings.entropy_coeff or 10.0, "num_slices": 16}
     if name == "JEPA":
         # The likelihood of a residual variance of 1/8. That of 1 tells a predictable direction from another
         # so weakly that the noise of the batches stays in the encoder.
@@ -573,32 +583,45 @@ def table(rows: Sequence[Row], settings: Settings) -> str:
     return "\n".join(lines).rstrip()
 
 
-def figure_scores(preset: str, rows: Sequence[Row], path: Path) -> None:
-    """R2 against noise scale, like the paper's figure of the performance metrics."""
-    keys = [["signal_r2_train", "noise_r2_train"], ["signal_r2", "noise_r2"]]
-    fig, axes = plt.subplots(2, 2, figsize=(9, 6.2), sharex=True, layout="constrained")
-    for ax, key in zip(axes.flat, sum(keys, []), strict=True):
+def figure_scores(preset: str, rows: Sequence[Row], settings: Settings, path: Path) -> None:
+    """What is lost of the signal and kept of the distractor, against noise scale."""
+    keys = ["signal_r2_train", "noise_r2_train", "signal_r2", "noise_r2"]
+    fig, axes = plt.subplots(2, 2, figsize=(9, 6.2), sharex=True, sharey="col", layout="constrained")
+    for ax, key in zip(axes.flat, keys, strict=True):
+        signal = "signal" in key
+        printed = {"signal_r2": PAPER_SIGNAL, "noise_r2": PAPER_NOISE}.get(key, {})
         for name, color in COLORS.items():
             here = [r for r in rows if r["model"] == name and r.get(key) is not None]
             scales = sorted({r["noise_scale"] for r in here})
-            values = [[r[key] for r in here if r["noise_scale"] == s] for s in scales]
+            groups = [[r for r in here if r["noise_scale"] == scale] for scale in scales]
+            values = [[1 - r[key] if signal else r[key] for r in group] for group in groups]
             if not values:
                 continue
             style = "--" if name in ORACLES else "-"
-            ax.plot(scales, [mean(v) for v in values], style, color=color, marker="o", ms=3.5, label=name)
-            low, high = [min(v) for v in values], [max(v) for v in values]
-            ax.fill_between(scales, low, high, color=color, alpha=0.15, lw=0)
-        what = "signal (higher is better)" if "signal" in key else "distractor (lower is better)"
-        ax.set_title(f"{'training' if 'train' in key else 'test'}: {what}")
-        ax.set_ylim(-0.1, 1.03)
+            ax.plot(scales, [mean(v) for v in values], style, color=color, label=name, **MARKERS[name])
+            if name not in ORACLES:
+                low, high = [min(v) for v in values], [max(v) for v in values]
+                ax.fill_between(scales, low, high, color=color, alpha=0.15, lw=0)
+            paper = [reference(printed, group[0], settings) for group in groups]
+            known = [(x, y) for x, y in zip(scales, paper, strict=True) if y is not None]
+            if known:
+                # The printed numbers have three digits: 1.000 may be 0.9995.
+                lost = [max(1 - y, 5e-4) if signal else y for _, y in known]
+                ax.plot([x for x, _ in known], lost, ":", color=color, lw=1.2)
+        part = "training" if "train" in key else "test"
+        ax.set_title(f"{part}: signal that is lost" if signal else f"{part}: distractor that is kept")
+        if signal:
+            ax.set(yscale="log", ylabel="1 - R2 of a linear probe")
+        else:
+            ax.set(ylim=(-0.1, 1.03), ylabel="R2 of a linear probe")
     for ax in axes[1]:
         ax.set_xlabel("noise scale of the distractor")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("R2 of a linear probe")
     several = len({row["seed"] for row in rows}) > 1
-    fig.suptitle(f"Preset {preset}" + (": mean, best and worst over seeds" if several else ""))
+    what = "mean, best and worst over seeds; lower is better" if several else "lower is better"
+    fig.suptitle(f"Preset {preset}: {what}")
+    axes[1, 0].plot([], [], ":", color="gray", lw=1.2, label="printed in the paper")
     handles = axes[1, 0].get_legend_handles_labels()
-    fig.legend(*handles, loc="outside lower center", ncols=len(COLORS), frameon=False)
+    fig.legend(*handles, loc="outside lower center", ncols=len(COLORS) + 1, frameon=False)
     fig.savefig(path, dpi=150)
     plt.close(fig)
 
@@ -607,33 +630,39 @@ def figure_signals(preset: str, shown: dict[Any, Any], runs: Sequence[Run], path
     """The signal that the probe reads off each representation, and the predictive variances."""
     names = [name for name in MODELS if any(key[:2] == (preset, name) for key in shown)]
     uncertain = any(shown[preset, name, runs[0].noise_scale][1] is not None for name in names)
-    fig, axes = plt.subplots(
-        2, len(runs), figsize=(4.5 * len(runs), 6), squeeze=False, sharey="row", layout="constrained"
-    )
+    num = len(names) + int(uncertain)
+    size = (4 * len(runs), 1.5 * num + 1)
+    fig, axes = plt.subplots(num, len(runs), figsize=size, squeeze=False, sharey="row", layout="constrained")
     latent_dim = runs[0].system.signal_dim
-    for run, (above, below) in zip(runs, axes.T, strict=True):
+    for run, column in zip(runs, axes.T, strict=True):
         scale = run.noise_scale
+        column[0].set_title(f"noise scale {scale:g}")
         signal = run.test["signal"][1 : SHOWN_STEPS + 1, 0]
-        above.plot(signal, color="black", lw=2, label="true signal")
-        for name in names:
+        for ax, name in zip(column, names, strict=False):
             predicted, relative = shown[preset, name, scale]
-            style = "--" if name in ("VAE", "AR") else "-"
             # A VAE speaks of the present: its curve begins one step earlier.
             times = torch.arange(len(predicted)) - int(name == "VAE")
-            above.plot(times, predicted, style, color=COLORS[name], lw=1, label=name)
+            ax.plot(signal, color="0.75", lw=3, label="true signal")
+            ax.plot(times, predicted, color=COLORS[name], lw=1, label=name)
+            ax.tick_params(labelbottom=name == names[-1])
             if relative is not None:
-                dims = torch.arange(len(relative)) + 0.2 * (name == "BJEPA") - 0.1
                 values = relative.sort(descending=True).values
-                below.bar(dims, values, width=0.2, color=COLORS[name], label=name)
-        above.set(title=f"noise scale {scale:g}", xlabel="time (steps)")
-        below.set(xlabel="latent dimension, most uncertain first", yscale="log", xticks=range(latent_dim))
-    axes[0, 0].set_ylabel("first component of the signal, test")
-    axes[1, 0].set_ylabel("predictive variance / variance of the mean")
-    for below in axes[1]:
-        below.set_visible(uncertain)
-    handles = axes[0, 0].get_legend_handles_labels()
-    fig.suptitle(f"Preset {preset}: the signal that a linear probe reads, and what the model is sure of")
-    fig.legend(*handles, loc="outside lower center", ncols=len(names) + 1, frameon=False)
+                column[-1].semilogy(values, color=COLORS[name], lw=1, **MARKERS[name])
+        column[len(names) - 1].set_xlabel("time (steps)")
+        if uncertain:
+            column[-1].set(xlabel="latent dimension, most uncertain first", xticks=range(latent_dim))
+            column[-1].margins(y=0.2)
+    for ax, name in zip(axes[:, 0], names, strict=False):
+        ax.set_ylabel(name)
+    if uncertain:
+        axes[-1, 0].set_ylabel("variance / var. of mean")
+    entries = [ax.get_legend_handles_labels() for ax in axes[:, 0]]
+    lines = {label: line for entry in entries for line, label in zip(*entry, strict=True)}
+    fig.suptitle(
+        f"Preset {preset}: first component of the signal, as a linear probe reads it (test)"
+        + (", and predictive variance" if uncertain else "")
+    )
+    fig.legend(lines.values(), lines, loc="outside lower center", ncols=len(lines), frameon=False)
     fig.savefig(path, dpi=150)
     plt.close(fig)
 
@@ -649,7 +678,7 @@ def draw(
     """The figures of a preset."""
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
     scores = out / f"noisy_tv_table_{preset}.png"
-    figure_scores(preset, [*rows, *ideal], scores)
+    figure_scores(preset, [*rows, *ideal], settings, scores)
     scales = [s for s in settings.noise_scales if s in (0, 4, 8)] or settings.noise_scales[-1:]
     runs = Run.simulate(settings.seeds[0], replace(settings, noise_scales=scales))
     signals = out / f"noisy_tv_signals_{preset}.png"
