@@ -36,8 +36,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "variance of the head, no entropy term": {"residual_variance": "head", "entropy": "none"},
     "scale of the target by the KL term": {"target_scale": "learned"},
     "one start": {"restarts": 1, "finalists": 1},
-    "eight starts, one finalist": {"finalists": 1},
-    "eight starts, eight finalists": {"finalists": 8},
+    "one finalist": {"finalists": 1},
+    "every start a finalist": {"finalists": 1000},
     "constant learning rate 0.3": {"schedule": "constant"},
     "constant learning rate 0.03": {"schedule": "constant", "lr": 0.03},
     "EMA decay 0.5": {"ema_decay": 0.5},
@@ -65,10 +65,11 @@ class Settings:
     )
     seeds: list[int] = option(list(range(10)), "each makes the matrices, the trajectories and the starts")
     noise_scales: list[float] = option([0.0, 4.0, 8.0], "scales of the distractor")
+    restarts: int = option(8, "starts of each run; 1 shows how often a single start succeeds")
 
 
-QUICK = {"seeds": [0], "noise_scales": [8.0], "variants": ["full recipe", "one start"]}
-QUICK_RECIPE = {"train_length": 600, "test_length": 200, "restarts": 2, "heat_steps": 6, "steps": 12}
+QUICK = {"seeds": [0], "noise_scales": [8.0], "variants": ["full recipe", "one start"], "restarts": 2}
+QUICK_RECIPE = {"train_length": 600, "test_length": 200, "heat_steps": 6, "steps": 12}
 
 
 def load_script() -> ModuleType:
@@ -115,12 +116,14 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Na
     parser.epilog = "variants: " + "; ".join(VARIANTS)
     for entry in fields(Settings):
         default = getattr(Settings(), entry.name)
-        shown = "all" if entry.name == "variants" else " ".join(map(str, default))
+        many = isinstance(default, list)
+        shown = " ".join(map(str, default)) if many else default
+        shown = "all" if entry.name == "variants" else shown
         more = {key: value for key, value in entry.metadata.items() if key != "help"}
         parser.add_argument(
             "--" + entry.name.replace("_", "-"),
-            type=type(default[0]),
-            nargs="+",
+            type=type(default[0] if many else default),
+            nargs="+" if many else None,
             help=f"{entry.metadata['help']} (default: {shown})",
             **more,
         )
@@ -137,7 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     settings, args = parse(arguments)
     torch.set_num_threads(1)
     script = load_script()
-    recipe = script.Settings(noise_scales=settings.noise_scales, **(QUICK_RECIPE if args.quick else {}))
+    recipe = script.Settings(noise_scales=settings.noise_scales, restarts=settings.restarts)
+    recipe = replace(recipe, **(QUICK_RECIPE if args.quick else {}))
     start = time.perf_counter()
     work = [
         (name, variant, seed)
