@@ -96,7 +96,7 @@ class Settings:
     steps: int = option(800, "optimiser steps")
     restarts: int = option(6, "starts trained side by side; the objective chooses one")
     skips: list[int] = option([1, 4, 16], "prediction steps that the encoder learns from")
-    skip_weights: list[float] = option([0.5, 0.3, 0.2], "their weights")
+    skip_weights: list[float] = option([0.1, 0.3, 0.6], "their weights")
     window: int = option(20, "steps in a training window, more than the largest skip")
     windows: int = option(24, "windows in a batch")
     lr: float = option(0.2, "peak learning rate")

@@ -174,6 +174,13 @@ def test_the_joint_region_of_a_gaussian_is_the_ellipsoid() -> None:
     assert coverage(p, target, 0.5, joint=True) == inside
 
 
+def test_the_joint_rank_counts_the_region_of_higher_density() -> None:
+    target = torch.tensor([[0.0, 0.0], [9.0, 30.0]]).double()
+    centre, far = probability_integral_transform(laplace(2), target, joint=True, generator=generator())
+    assert centre < 0.01
+    assert far > 0.99
+
+
 def test_points_cover_only_themselves() -> None:
     p = Delta(torch.zeros(4, D))
     target = torch.tensor([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 1.0]])
@@ -667,6 +674,22 @@ def test_other_distributions_are_recalibrated_too(head: Head, method: str) -> No
     assert temperature.item() == pytest.approx(2.5, rel=0.1)
     table = calibration_by_skip(one_step, pairs, levels=[0.9], num_samples=50, generator=generator())
     assert table.coverage.item() == pytest.approx(0.9, abs=0.03)
+
+
+@pytest.mark.parametrize("step", [6.0, -6.0])
+def test_each_side_of_a_skewed_belief_has_its_own_reach(step: float) -> None:
+    model, _ = _world(SkewedHead())
+    model.predictor.skips = (1,)
+    path = (step * torch.arange(60.0).double()).reshape(1, 60, 1).expand(1, 60, D)
+    data = TensorDict(observation=path, action=torch.zeros(1, 60, 1).double(), batch_size=(1, 60))
+    p = model.predictor.dist(path[:, :1], data["action"][:, :1])
+    low, high = credible_interval(p, 0.9, num_samples=50_000, generator=generator(1))
+    end = high if step > 0 else low
+    assert ((high - p.mean) / (p.mean - low)).min() > 1.1  # the sides differ
+    expected = (step / (end - p.mean)).mean().item()
+    temperature = recalibrate(model, data, method="coverage", num_samples=2000, generator=generator())
+    # The 0.9 quantile over latents of an interval's sampling error, about 2 %, is in it too.
+    assert temperature.item() == pytest.approx(expected, rel=0.05)
 
 
 def test_by_skip_is_what_the_pairs_say() -> None:

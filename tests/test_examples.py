@@ -10,6 +10,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,8 @@ from sklearn.metrics import r2_score
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
+
+from torchrl_vjepa import diag_gaussian
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = sorted((ROOT / "examples").glob("[!_]*.py"))
@@ -55,6 +58,7 @@ CLIFF_KEYS = {
     "success_rate",
 }
 UNCERTAINTY_KEYS = {"noise_scale", "seed", "horizon", "coverage_90", "crps", "oracle_crps"}
+FORK_KEYS = {"head", "planner", "seed", "test_log_prob", "wall_mass", "success"}
 # "path:line: Category: message", raised at a line of this repository
 WARNING = re.compile(r"\S*(?:torchrl_vjepa|examples)/\S*\.py:\d+: \w*Warning: .*")
 
@@ -92,6 +96,16 @@ def run(script: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     report = folder / "report.json"
     done = start(script, ["--quick", "--out", "figures", "--json", str(report)], folder)
     return Run(done.returncode, done.stdout, done.stderr, folder, report)
+
+
+def load(name: str, folder: str = "examples") -> Iterator[Any]:
+    """A script as a module, for as long as a fixture lives."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / folder / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
 
 
 def reject_constant(name: str) -> float:
@@ -221,7 +235,40 @@ def check_uncertainty_report(report: dict[str, Any]) -> None:
         assert math.isclose(main[cell]["crps_ratio"], row["crps"] / row["oracle_crps"], rel_tol=1e-9)
 
 
+def check_fork_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``fork.py``: its keys, its ranges, and one row for each head and planner."""
+    assert set(report) == {"settings", "wall_s", "rows", "oracle", "mean_in_wall"}
+    settings, rows = report["settings"], report["rows"]
+    assert report["wall_s"] > 0
+    expected = {
+        (head, planner, seed)
+        for head in settings["heads"]
+        for planner in ("sample", "mean")
+        for seed in settings["seeds"]
+    }
+    assert len(rows) == len(expected)
+    assert {(row["head"], row["planner"], row["seed"]) for row in rows} == expected
+    for row in [*rows, *report["oracle"]]:
+        assert set(row) == FORK_KEYS
+        assert math.isfinite(row["test_log_prob"])
+        assert 0.0 <= row["wall_mass"] <= 1.0
+        assert 0.0 <= row["success"] <= 1.0
+    for head, _, seed in expected:
+        beliefs = {
+            (row["test_log_prob"], row["wall_mass"])
+            for row in rows
+            if (row["head"], row["seed"]) == (head, seed)
+        }
+        assert len(beliefs) == 1, "both planners have the same model"
+    assert {(row["planner"], row["seed"]) for row in report["oracle"]} == {cell[1:] for cell in expected}
+    assert {(row["head"], row["seed"]) for row in report["mean_in_wall"]} == {
+        (head, seed) for head, _, seed in expected
+    }
+    assert all(0.0 <= row["mean_in_wall"] <= 1.0 for row in report["mean_in_wall"])
+
+
 CHECKS = {
+    "fork": check_fork_report,
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,
     "surprise": check_surprise_report,
@@ -353,6 +400,109 @@ def test_the_table_check_sees(change: dict[str, Any]) -> None:
         check_table_report(report)
 
 
+def valid_fork() -> dict[str, Any]:
+    settings = {"heads": ["DiagGaussianHead", "MixtureHead"], "seeds": [3]}
+    numbers = {"seed": 3, "test_log_prob": -1.5, "wall_mass": 0.25, "success": 0.5}
+    planners = ("sample", "mean")
+    return {
+        "settings": settings,
+        "wall_s": 1.0,
+        "rows": [{"head": head, "planner": how, **numbers} for head in settings["heads"] for how in planners],
+        "oracle": [{"head": "true density", "planner": how, **numbers} for how in planners],
+        "mean_in_wall": [{"head": head, "seed": 3, "mean_in_wall": 1.0} for head in settings["heads"]],
+    }
+
+
+def test_the_fork_check_accepts_a_valid_report() -> None:
+    check_fork_report(valid_fork())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"head": "DiagGaussianHead"},
+        {"planner": "sample"},
+        {"seed": 4},
+        {"test_log_prob": math.nan},
+        {"test_log_prob": -2.0},
+        {"wall_mass": 1.5},
+        {"success": -0.5},
+        {"extra": 1},
+    ],
+)
+def test_the_fork_check_sees(change: dict[str, Any]) -> None:
+    report = valid_fork()
+    report["rows"][-1].update(change)
+    with pytest.raises(AssertionError):
+        check_fork_report(report)
+
+
+# What the fork computes
+
+
+@pytest.fixture(scope="module")
+def fork() -> Any:
+    """The script as a module."""
+    yield from load("fork")
+
+
+def test_the_fork_learns_from_crashes_too(fork: Any) -> None:
+    """A crash is only ever a next observation; each step of an episode is there once."""
+    data = fork.collect(200, seed=0)
+    system = fork.ForkSystem()
+    before, after = data["observation"].unbind(1)
+    assert not system.in_wall(before).any()
+    crashed = system.in_wall(after)
+    assert crashed.sum() > 10
+    starts = (before[:, 0] == system.start_along).nonzero().squeeze(-1)
+    assert len(starts) == 200
+    ends = torch.cat([starts[1:], torch.tensor([len(before)])])
+    assert (crashed[ends - 1] | (ends - starts == system.episode_length)).all()
+    assert crashed.sum() == crashed[ends - 1].sum()
+    density = system.dist(before, data["action"][:, 0]).log_prob(after)
+    assert density.min() > -20, "the action is that of the step"
+
+
+def test_the_forks_densities_are_those_of_positions(fork: Any) -> None:
+    """A Gaussian in the latent, by hand in the coordinates of the road."""
+    torch.manual_seed(0)
+    matrix, offset = torch.randn(2, 2), torch.randn(2)
+    belief = fork.Belief(
+        lambda latent, action: diag_gaussian(latent + action, torch.tensor([0.3, 0.7])), matrix, offset
+    )
+    position, action = torch.randn(5, 2), torch.randn(5, 1)
+    inverse = torch.linalg.inv(matrix)
+    loc = position + action @ torch.ones(1, 2) @ inverse.mT
+    covariance = inverse @ torch.diag(torch.tensor([0.09, 0.49])) @ inverse.mT
+    expected = torch.distributions.MultivariateNormal(loc, covariance)
+    after = torch.randn(5, 2)
+    torch.testing.assert_close(
+        belief.log_prob(position, action, after), expected.log_prob(after), rtol=1e-3, atol=1e-3
+    )
+    torch.testing.assert_close(belief.mean(position, action), loc, rtol=1e-4, atol=1e-4)
+    samples = belief.sample(position, action, 20_000)
+    torch.testing.assert_close(samples.mean(0), loc, rtol=0, atol=5 * covariance.max().sqrt().item() / 140)
+
+
+def test_the_forks_belief_reads_the_encoder_off(fork: Any) -> None:
+    settings = fork.Settings(train_steps=2, batch_size=16, num_cells=8)
+    data = fork.collect(20, seed=0)
+    model = fork.train("FullGaussianHead", data, 0, settings)
+    belief = fork.Belief.of(model)
+    position = data["observation"][:, 0]
+    latent = model.encoder(TensorDict(observation=position, batch_size=[len(position)]))["latent"]
+    torch.testing.assert_close(belief.encode(position), latent, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(belief.decode(latent), position, rtol=1e-3, atol=1e-3)
+
+
+def test_the_forks_aims_are_safe_though_the_mean_is_not(fork: Any) -> None:
+    system = fork.ForkSystem()
+    position, action = fork.safe_aims(fork.collect(300, seed=1), system)
+    assert len(position) > 50
+    assert system.wall_mass(position, action).max() < 1e-3
+    assert system.in_wall(system.dist(position, action).mean).all()
+
+
 # What the table computes
 
 
@@ -363,21 +513,10 @@ def table_settings(module: Any, **changes: Any) -> Any:
     return module.Settings(**{**small, **race, "sizes": [2, 2, 6], **changes})
 
 
-def load_module(path: str) -> Any:
-    """A script as a module."""
-    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
 def table() -> Any:
     """The script as a module."""
-    module = load_module("examples/noisy_tv_table.py")
-    yield module
-    del sys.modules["noisy_tv_table"]
+    yield from load("noisy_tv_table")
 
 
 @pytest.mark.parametrize("encoder", ["linear", "mlp"])
@@ -531,8 +670,13 @@ def test_every_ingredient_of_the_robust_recipe_can_be_changed(
     assert changed["signal_r2"] != full_recipe["signal_r2"]
 
 
-def test_the_ablations_change_one_recipe() -> None:
-    ablations = load_module("benchmarks/ablations.py")
+@pytest.fixture(scope="module")
+def ablations() -> Any:
+    """The benchmark as a module."""
+    yield from load("ablations", "benchmarks")
+
+
+def test_the_ablations_change_one_recipe(ablations: Any) -> None:
     script = ablations.load_script()
     full = script.Settings()
     for variant, changes in ablations.VARIANTS.items():

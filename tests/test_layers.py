@@ -23,7 +23,9 @@ LAYERS = {
     "distributions": 0,
     "generators": 0,
     "stacking": 0,
+    "fork": 0,
     "noisy_tv": 0,
+    "simulation": 0,
     "statistics": 0,
     "windows": 0,
     "belief": 1,
@@ -48,6 +50,8 @@ LAYERS = {
 SIDEWAYS = {
     ("distributions", "stacking"),
     ("statistics", "stacking"),
+    ("fork", "simulation"),
+    ("noisy_tv", "simulation"),
     ("encoders", "whitening"),
     ("baselines", "models"),
     ("baselines", "objectives"),

@@ -53,6 +53,7 @@ from torchrl_vjepa.distributions import (
 )
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.fork import BatchedForkEnv, ForkEnv, ForkSystem
 from torchrl_vjepa.heads import (
     DeltaHead,
     DiagGaussianHead,
@@ -96,6 +97,7 @@ __all__ = [
     "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
+    "BatchedForkEnv",
     "BatchedNoisyTVEnv",
     "CEM",
     "Calibration",
@@ -111,6 +113,8 @@ __all__ = [
     "EnsembleHead",
     "EnvObjective",
     "FlowHead",
+    "ForkEnv",
+    "ForkSystem",
     "FullGaussianHead",
     "FusedPredictor",
     "GaussianPrior",

@@ -60,8 +60,7 @@ def propagate_moments(
 
     Raises:
         ValueError: if shapes disagree, the plan is empty, ``method`` is unknown, or ``covariance`` is
-            not finite, symmetric and positive semi-definite.
-        TypeError: if the transition returns a distribution without moments in closed form.
+            not finite, symmetric and positive semi-definite, or the transition's events are no vectors.
 
     Examples:
         >>> import torch

@@ -12,11 +12,8 @@ from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from torchrl_vjepa.noisy_tv.system import (
-    LinearGaussianSystem,
-    check_nonnegative,
-    check_positive_int,
-)
+from torchrl_vjepa.noisy_tv.system import LinearGaussianSystem
+from torchrl_vjepa.simulation import check_nonnegative, check_positive_int
 
 __all__ = ["KalmanFilter", "LQGController", "LQRSolution", "solve_lqr"]
 

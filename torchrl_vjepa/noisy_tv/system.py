@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +9,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-__all__ = ["LinearGaussianSystem", "check_nonnegative", "check_positive_int", "linear_recurrence"]
+from torchrl_vjepa.simulation import check_nonnegative, check_positive_int
+
+__all__ = ["LinearGaussianSystem", "linear_recurrence"]
 
 MatrixLike = Tensor | np.ndarray | Sequence[Sequence[float]]
 VectorLike = Tensor | np.ndarray | Sequence[float]
@@ -40,57 +40,6 @@ def linear_recurrence(matrix: Tensor, inputs: Tensor) -> Tensor:
         states[..., shift:, :] += states[..., :-shift, :] @ power.mT
         power, shift = power @ power, 2 * shift
     return states
-
-
-def check_nonnegative(name: str, value: float) -> float:
-    """Returns ``value`` as a float, or refuses it.
-
-    Args:
-        name: the argument's name, for the error message.
-        value: the number to check: finite and at least 0.
-
-    Returns:
-        The same number as a ``float``.
-
-    Raises:
-        ValueError: if it is negative, infinite or NaN.
-
-    Examples:
-        >>> check_nonnegative("noise_scale", 8)
-        8.0
-    """
-    number = float(value)
-    if not 0.0 <= number < math.inf:
-        raise ValueError(f"{name} must be a finite number of at least 0, got {value}.")
-    return number
-
-
-def check_positive_int(name: str, value: int, minimum: int = 1) -> int:
-    """Returns ``value`` as an int of at least ``minimum``, or refuses it.
-
-    Args:
-        name: the argument's name, for the error message.
-        value: the number to check.
-        minimum: the smallest number allowed.
-
-    Returns:
-        The same number as an ``int``.
-
-    Raises:
-        TypeError: if it is not an integer.
-        ValueError: if it is too small.
-
-    Examples:
-        >>> check_positive_int("num_steps", 3)
-        3
-    """
-    try:
-        value = operator.index(value)
-    except TypeError:
-        raise TypeError(f"{name} must be an integer, got {value!r}.") from None
-    if value < minimum:
-        raise ValueError(f"{name} must be at least {minimum}, got {value}.")
-    return value
 
 
 def _check_array(name: str, value: object, shape: tuple[int, ...]) -> Tensor:
