@@ -67,6 +67,15 @@ COLORS = {
     "BJEPA": "#CC79A7",
     "Kalman filter": "black",
 }
+# Nested where the curves of the models coincide.
+MARKERS: dict[str, dict[str, Any]] = {
+    "VAE": {"marker": "^", "ms": 5},
+    "AR": {"marker": "v", "ms": 5},
+    "JEPA": {"marker": "o", "ms": 10, "mfc": "none"},
+    "VJEPA": {"marker": "s", "ms": 6, "mfc": "none"},
+    "BJEPA": {"marker": "D", "ms": 2.5},
+    "Kalman filter": {},
+}
 # The paper's table (seed 111): test R2 of signal and noise at the scales 0, 1, ..., 8.
 PAPER_SIGNAL = {
     "VAE": [1.000, 0.973, 0.853, 0.770, 0.730, 0.681, 0.627, 0.566, 0.499],
@@ -116,6 +125,31 @@ class Settings:
     heat_steps: int = option(75, "robust: optimiser steps of the first round, which all starts train")
     skips: list[int] = option([1, 8, 16], "robust: prediction steps that are learned together")
     skip_weights: list[float] = option([0.04, 0.48, 0.48], "robust: their weights")
+    normalisation: str = option(
+        "whitening",
+        "robust: whitening, or standard scores of each component as in the paper",
+        choices=["whitening", "standard"],
+    )
+    entropy: str = option(
+        "moments",
+        "robust: the entropy term of the bound: of the moments, of random projections (SIGReg), or none",
+        choices=["moments", "sliced", "none"],
+    )
+    entropy_coeff: float = option(0.0, "robust: its weight; 0 is 1 (moments) or 10 (sliced)")
+    residual_variance: str = option(
+        "batch",
+        "robust, VJEPA and BJEPA: the closed form of the batch, or what the head has learned",
+        choices=["batch", "head"],
+    )
+    target_scale: str = option(
+        "constant",
+        "robust, VJEPA and BJEPA: constant (0.01), or learned by the KL term as in the paper",
+        choices=["constant", "learned"],
+    )
+    schedule: str = option(
+        "one-cycle", "robust: of the learning rate, in each round", choices=["one-cycle", "constant"]
+    )
+    ema_decay: float = option(0.9, "robust: decay of the EMA target encoder")
     window: int = option(20, "robust: steps in a window, more than the largest skip")
     windows: int = option(24, "robust: windows in a batch")
     lr: float = option(0.0, "peak learning rate; 0 is 0.001 (paper) or 0.3 (robust)")
@@ -169,10 +203,10 @@ class Run:
             for scale in settings.noise_scales
         ]
 
-    def normalise(self, preset: str) -> tuple[Tensor, Tensor]:
+    def normalise(self, normalisation: str) -> tuple[Tensor, Tensor]:
         """Training and test observations, centred and scaled by statistics of the training ones."""
         train, test = self.train["observation"], self.test["observation"]
-        if preset == "paper":
+        if normalisation == "standard":
             mean, std = train.mean(0), train.std(0)
             return (train - mean) / std, (test - mean) / std
         whitening = Whitening(self.system.observation_dim)
@@ -244,23 +278,25 @@ def robust_model(name: str, settings: Settings) -> Any:
     if name == "JEPA":
         return JEPA(encoder, predictor)
     model = {"VJEPA": VJEPA, "BJEPA": BJEPA}[name]
-    target_scale = TargetScale(latent_dim, kind="constant", init_std=0.01)
+    target_scale = TargetScale(latent_dim, kind=settings.target_scale, init_std=0.01)
     return model(encoder, predictor, target_scale=target_scale)
 
 
 def robust_loss(name: str, models: Sequence[Any], settings: Settings) -> WindowLoss:
     """The mutual information bound: predict well, keep the entropy."""
-    common = {
-        "stacked_data": True,
-        "skip_weights": settings.skip_weights,
-        "marginal_entropy_coeff": 1.0,
-        "collapse_rank": 0.0,
-    }
+    common = {"stacked_data": True, "skip_weights": settings.skip_weights, "collapse_rank": 0.0}
+    if settings.entropy == "moments":
+        common["marginal_entropy_coeff"] = settings.entropy_coeff or 1.0
+    elif settings.entropy == "sliced":
+        # A few directions are enough for a small latent: each step draws others.
+        common |= {"sliced_entropy_coeff": settings.entropy_coeff or 10.0, "num_slices": 16}
     if name == "JEPA":
         # The likelihood of a residual variance of 1/8. That of 1 tells a predictable direction from another
         # so weakly that the noise of the batches stays in the encoder.
         return JEPALoss(models, prediction_coeff=4.0, **common)
-    common |= {"target_kl_coeff": 0.0, "residual_variance": "batch"}
+    # A constant scale has nothing to learn from the KL term.
+    common["target_kl_coeff"] = BETA if settings.target_scale == "learned" else 0.0
+    common["residual_variance"] = settings.residual_variance
     if name == "VJEPA":
         return VJEPALoss(models, **common)
     return BJEPALoss(models, structural_kl_coeff=GAMMA, **common)
@@ -312,7 +348,7 @@ def same_moments(observations: Tensor) -> Tensor:
 
 def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[Any]:
     """Full-batch Adam at a constant learning rate; one model for each run."""
-    observations = torch.stack([run.normalise("paper")[0] for run in runs])
+    observations = torch.stack([run.normalise("standard")[0] for run in runs])
     if settings.encoder == "linear" and name in ("AR", "JEPA"):
         windows = same_moments(observations)
     else:
@@ -336,7 +372,7 @@ def train_paper(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[
 
 def train_robust(name: str, runs: Sequence[Run], settings: Settings) -> Iterator[Any]:
     """Two rounds: all starts of a run train a little, the best few train on; the objective chooses."""
-    observations = torch.stack([run.normalise("robust")[0] for run in runs])
+    observations = torch.stack([run.normalise(settings.normalisation)[0] for run in runs])
     models = make_models(robust_model, name, runs, settings.restarts, settings)
     rounds = [(settings.heat_steps, settings.finalists), (settings.steps or 100, 1)]
     for steps, keep in rounds:
@@ -349,7 +385,7 @@ def train_robust(name: str, runs: Sequence[Run], settings: Settings) -> Iterator
 
 def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Settings) -> Tensor:
     """One cycle of a large learning rate on minibatches; the score of each start, a row for each run."""
-    updater = SoftUpdate(loss, eps=0.9)
+    updater = SoftUpdate(loss, eps=settings.ema_decay)
     lr = settings.lr or 0.3
     mlp = [param for key, param in loss.named_parameters() if "mlp" in key]
     rest = [param for key, param in loss.named_parameters() if "mlp" not in key]
@@ -357,9 +393,13 @@ def fit_robust(loss: WindowLoss, observations: Tensor, steps: int, settings: Set
     if mlp:
         groups.append({"params": mlp, "lr": 0.1 * lr, "weight_decay": 1.0})
     optimizer = torch.optim.AdamW(groups, betas=(0.8, 0.99), fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, [group["lr"] for group in groups], total_steps=steps, pct_start=0.2, cycle_momentum=False
-    )
+    if settings.schedule == "constant":
+        schedule = torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
+    else:
+        peaks = [group["lr"] for group in groups]
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, peaks, total_steps=steps, pct_start=0.2, cycle_momentum=False
+        )
     starts_of_a_run = loss.num_models // len(observations)
     select_objective(loss)
 
@@ -443,13 +483,14 @@ def run_task(task: tuple[str, str, int], settings: Settings) -> tuple[list[Row],
     preset, name, seed = task
     torch.set_num_threads(1)
     runs = Run.simulate(seed, settings)
+    normalisation = "standard" if preset == "paper" else settings.normalisation
     start = time.perf_counter()
     train = train_paper if preset == "paper" else train_robust
     models = list(train(name, runs, settings))
     seconds = (time.perf_counter() - start) / len(runs)
     rows, shown = [], {}
     for run, model in zip(runs, models, strict=True):
-        outputs = [represent(name, model, observations) for observations in run.normalise(preset)]
+        outputs = [represent(name, model, observations) for observations in run.normalise(normalisation)]
         scores, predicted = probe(
             [latent for latent, _ in outputs], run, 0 if name == "VAE" else 1, settings.r2
         )
@@ -543,32 +584,45 @@ def table(rows: Sequence[Row], settings: Settings) -> str:
     return "\n".join(lines).rstrip()
 
 
-def figure_scores(preset: str, rows: Sequence[Row], path: Path) -> None:
-    """R2 against noise scale, like the paper's figure of the performance metrics."""
-    keys = [["signal_r2_train", "noise_r2_train"], ["signal_r2", "noise_r2"]]
-    fig, axes = plt.subplots(2, 2, figsize=(9, 6.2), sharex=True, layout="constrained")
-    for ax, key in zip(axes.flat, sum(keys, []), strict=True):
+def figure_scores(preset: str, rows: Sequence[Row], settings: Settings, path: Path) -> None:
+    """What is lost of the signal and kept of the distractor, against noise scale."""
+    keys = ["signal_r2_train", "noise_r2_train", "signal_r2", "noise_r2"]
+    fig, axes = plt.subplots(2, 2, figsize=(9, 6.2), sharex=True, sharey="col", layout="constrained")
+    for ax, key in zip(axes.flat, keys, strict=True):
+        signal = "signal" in key
+        printed = {"signal_r2": PAPER_SIGNAL, "noise_r2": PAPER_NOISE}.get(key, {})
         for name, color in COLORS.items():
             here = [r for r in rows if r["model"] == name and r.get(key) is not None]
             scales = sorted({r["noise_scale"] for r in here})
-            values = [[r[key] for r in here if r["noise_scale"] == s] for s in scales]
+            groups = [[r for r in here if r["noise_scale"] == scale] for scale in scales]
+            values = [[1 - r[key] if signal else r[key] for r in group] for group in groups]
             if not values:
                 continue
             style = "--" if name in ORACLES else "-"
-            ax.plot(scales, [mean(v) for v in values], style, color=color, marker="o", ms=3.5, label=name)
-            low, high = [min(v) for v in values], [max(v) for v in values]
-            ax.fill_between(scales, low, high, color=color, alpha=0.15, lw=0)
-        what = "signal (higher is better)" if "signal" in key else "distractor (lower is better)"
-        ax.set_title(f"{'training' if 'train' in key else 'test'}: {what}")
-        ax.set_ylim(-0.1, 1.03)
+            ax.plot(scales, [mean(v) for v in values], style, color=color, label=name, **MARKERS[name])
+            if name not in ORACLES:
+                low, high = [min(v) for v in values], [max(v) for v in values]
+                ax.fill_between(scales, low, high, color=color, alpha=0.15, lw=0)
+            paper = [reference(printed, group[0], settings) for group in groups]
+            known = [(x, y) for x, y in zip(scales, paper, strict=True) if y is not None]
+            if known:
+                # The printed numbers have three digits: 1.000 may be 0.9995.
+                lost = [max(1 - y, 5e-4) if signal else y for _, y in known]
+                ax.plot([x for x, _ in known], lost, ":", color=color, lw=1.2)
+        part = "training" if "train" in key else "test"
+        ax.set_title(f"{part}: signal that is lost" if signal else f"{part}: distractor that is kept")
+        if signal:
+            ax.set(yscale="log", ylabel="1 - R2 of a linear probe")
+        else:
+            ax.set(ylim=(-0.1, 1.03), ylabel="R2 of a linear probe")
     for ax in axes[1]:
         ax.set_xlabel("noise scale of the distractor")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("R2 of a linear probe")
     several = len({row["seed"] for row in rows}) > 1
-    fig.suptitle(f"Preset {preset}" + (": mean, best and worst over seeds" if several else ""))
+    what = "mean, best and worst over seeds; lower is better" if several else "lower is better"
+    fig.suptitle(f"Preset {preset}: {what}")
+    axes[1, 0].plot([], [], ":", color="gray", lw=1.2, label="printed in the paper")
     handles = axes[1, 0].get_legend_handles_labels()
-    fig.legend(*handles, loc="outside lower center", ncols=len(COLORS), frameon=False)
+    fig.legend(*handles, loc="outside lower center", ncols=len(COLORS) + 1, frameon=False)
     fig.savefig(path, dpi=150)
     plt.close(fig)
 
@@ -577,33 +631,39 @@ def figure_signals(preset: str, shown: dict[Any, Any], runs: Sequence[Run], path
     """The signal that the probe reads off each representation, and the predictive variances."""
     names = [name for name in MODELS if any(key[:2] == (preset, name) for key in shown)]
     uncertain = any(shown[preset, name, runs[0].noise_scale][1] is not None for name in names)
-    fig, axes = plt.subplots(
-        2, len(runs), figsize=(4.5 * len(runs), 6), squeeze=False, sharey="row", layout="constrained"
-    )
+    num = len(names) + int(uncertain)
+    size = (4 * len(runs), 1.5 * num + 1)
+    fig, axes = plt.subplots(num, len(runs), figsize=size, squeeze=False, sharey="row", layout="constrained")
     latent_dim = runs[0].system.signal_dim
-    for run, (above, below) in zip(runs, axes.T, strict=True):
+    for run, column in zip(runs, axes.T, strict=True):
         scale = run.noise_scale
+        column[0].set_title(f"noise scale {scale:g}")
         signal = run.test["signal"][1 : SHOWN_STEPS + 1, 0]
-        above.plot(signal, color="black", lw=2, label="true signal")
-        for name in names:
+        for ax, name in zip(column, names, strict=False):
             predicted, relative = shown[preset, name, scale]
-            style = "--" if name in ("VAE", "AR") else "-"
             # A VAE speaks of the present: its curve begins one step earlier.
             times = torch.arange(len(predicted)) - int(name == "VAE")
-            above.plot(times, predicted, style, color=COLORS[name], lw=1, label=name)
+            ax.plot(signal, color="0.75", lw=3, label="true signal")
+            ax.plot(times, predicted, color=COLORS[name], lw=1, label=name)
+            ax.tick_params(labelbottom=name == names[-1])
             if relative is not None:
-                dims = torch.arange(len(relative)) + 0.2 * (name == "BJEPA") - 0.1
                 values = relative.sort(descending=True).values
-                below.bar(dims, values, width=0.2, color=COLORS[name], label=name)
-        above.set(title=f"noise scale {scale:g}", xlabel="time (steps)")
-        below.set(xlabel="latent dimension, most uncertain first", yscale="log", xticks=range(latent_dim))
-    axes[0, 0].set_ylabel("first component of the signal, test")
-    axes[1, 0].set_ylabel("predictive variance / variance of the mean")
-    for below in axes[1]:
-        below.set_visible(uncertain)
-    handles = axes[0, 0].get_legend_handles_labels()
-    fig.suptitle(f"Preset {preset}: the signal that a linear probe reads, and what the model is sure of")
-    fig.legend(*handles, loc="outside lower center", ncols=len(names) + 1, frameon=False)
+                column[-1].semilogy(values, color=COLORS[name], lw=1, **MARKERS[name])
+        column[len(names) - 1].set_xlabel("time (steps)")
+        if uncertain:
+            column[-1].set(xlabel="latent dimension, most uncertain first", xticks=range(latent_dim))
+            column[-1].margins(y=0.2)
+    for ax, name in zip(axes[:, 0], names, strict=False):
+        ax.set_ylabel(name)
+    if uncertain:
+        axes[-1, 0].set_ylabel("variance / var. of mean")
+    entries = [ax.get_legend_handles_labels() for ax in axes[:, 0]]
+    lines = {label: line for entry in entries for line, label in zip(*entry, strict=True)}
+    fig.suptitle(
+        f"Preset {preset}: first component of the signal, as a linear probe reads it (test)"
+        + (", and predictive variance" if uncertain else "")
+    )
+    fig.legend(lines.values(), lines, loc="outside lower center", ncols=len(lines), frameon=False)
     fig.savefig(path, dpi=150)
     plt.close(fig)
 
@@ -619,7 +679,7 @@ def draw(
     """The figures of a preset."""
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
     scores = out / f"noisy_tv_table_{preset}.png"
-    figure_scores(preset, [*rows, *ideal], scores)
+    figure_scores(preset, [*rows, *ideal], settings, scores)
     scales = [s for s in settings.noise_scales if s in (0, 4, 8)] or settings.noise_scales[-1:]
     runs = Run.simulate(settings.seeds[0], replace(settings, noise_scales=scales))
     signals = out / f"noisy_tv_signals_{preset}.png"
@@ -636,6 +696,10 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Na
     settings, args = read_settings(parser, Settings, QUICK, arguments)
     if settings.preset == ["robust"] and not set(settings.models) & set(LATENT_MODELS):
         parser.error("VAE and AR have the preset paper only")
+    if settings.entropy == "none" and settings.entropy_coeff:
+        parser.error(f"--entropy none has no weight, got --entropy-coeff {settings.entropy_coeff:g}")
+    if "robust" in settings.preset and min(settings.heat_steps, settings.steps or 100) < 6:
+        parser.error("--heat-steps and --steps must be at least 6 with the preset robust: a cycle needs them")
     return settings, args
 
 

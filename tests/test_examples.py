@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import importlib.util
 import json
 import math
 import os
@@ -12,6 +13,7 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,6 +105,16 @@ def run(script: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     report = folder / "report.json"
     done = start(script, ["--quick", "--out", "figures", "--json", str(report)], folder)
     return Run(done.returncode, done.stdout, done.stderr, folder, report)
+
+
+def load(name: str, folder: str = "examples") -> Iterator[Any]:
+    """A script as a module, for as long as a fixture lives."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / folder / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
 
 
 def reject_constant(name: str) -> float:
@@ -232,15 +244,6 @@ def check_uncertainty_report(report: dict[str, Any]) -> None:
         assert math.isclose(main[cell]["crps_ratio"], row["crps"] / row["oracle_crps"], rel_tol=1e-9)
 
 
-CHECKS = {
-    "noisy_tv_mppi": check_report,
-    "noisy_tv_table": check_table_report,
-    "surprise": check_surprise_report,
-    "cliff": check_cliff_report,
-    "uncertainty": check_uncertainty_report,
-}
-
-
 def check_fork_report(report: dict[str, Any]) -> None:
     """Checks the report of ``fork.py``: its keys, its ranges, and one row for each head and planner."""
     assert set(report) == {"settings", "wall_s", "rows", "oracle", "mean_in_wall"}
@@ -273,7 +276,14 @@ def check_fork_report(report: dict[str, Any]) -> None:
     assert all(0.0 <= row["mean_in_wall"] <= 1.0 for row in report["mean_in_wall"])
 
 
-CHECKS = {"fork": check_fork_report, "noisy_tv_mppi": check_report, "noisy_tv_table": check_table_report}
+CHECKS = {
+    "fork": check_fork_report,
+    "noisy_tv_mppi": check_report,
+    "noisy_tv_table": check_table_report,
+    "surprise": check_surprise_report,
+    "cliff": check_cliff_report,
+    "uncertainty": check_uncertainty_report,
+}
 
 
 def test_there_are_examples() -> None:
@@ -577,7 +587,7 @@ def test_every_start_of_a_race_trains(table: Any, encoder: str) -> None:
     (run,) = table.Run.simulate(0, settings)
     before = table.make_models(table.robust_model, "VJEPA", [run], 2, settings)
     models = table.make_models(table.robust_model, "VJEPA", [run], 2, settings)
-    observations = run.normalise("robust")[0].unsqueeze(0)
+    observations = run.normalise("whitening")[0].unsqueeze(0)
     for _ in range(2):
         loss = table.robust_loss("VJEPA", models, settings)
         scores = table.fit_robust(loss, observations, 4, settings)
@@ -593,7 +603,7 @@ def test_every_start_of_a_race_trains(table: Any, encoder: str) -> None:
 def test_few_pairs_give_the_losses_and_gradients_of_all(table: Any, name: str) -> None:
     settings = table_settings(table, noise_scales=[0.0, 8.0])
     runs = table.Run.simulate(0, settings)
-    observations = torch.stack([run.normalise("paper")[0] for run in runs]).double()
+    observations = torch.stack([run.normalise("standard")[0] for run in runs]).double()
     few = table.same_moments(observations)
     everything = torch.stack([observations[:, :-1], observations[:, 1:]], dim=2)
     assert few.shape == (2, 13, 2, 6)
@@ -644,11 +654,72 @@ def test_cca_finds_the_signal_without_labels(table: Any) -> None:
     assert min(scores.values()) > 0.98
 
 
-@pytest.mark.parametrize("wrong", [["--models", "PCA"], ["--preset", "robust", "--models", "VAE"]])
-def test_the_table_refuses(table: Any, wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.fixture(scope="module")
+def full_recipe(table: Any) -> dict[str, Any]:
+    """A row of the robust preset."""
+    (row,), _ = table.run_task(("robust", "VJEPA", 0), table_settings(table))
+    return row
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"normalisation": "standard"},
+        {"entropy": "none"},
+        {"entropy": "sliced"},
+        {"entropy_coeff": 0.5},
+        {"residual_variance": "head"},
+        {"target_scale": "learned"},
+        {"schedule": "constant"},
+        {"ema_decay": 0.99},
+        {"skip_weights": [1.0, 1.0, 1.0]},
+        {"finalists": 1, "restarts": 1},
+        {"lr": 0.1},
+    ],
+    ids=str,
+)
+def test_every_ingredient_of_the_robust_recipe_can_be_changed(
+    table: Any, full_recipe: dict[str, Any], change: dict[str, Any]
+) -> None:
+    (changed,), _ = table.run_task(("robust", "VJEPA", 0), table_settings(table, **change))
+    assert math.isfinite(changed["signal_r2"])
+    assert changed["signal_r2"] != full_recipe["signal_r2"]
+
+
+@pytest.fixture(scope="module")
+def ablations() -> Any:
+    """The benchmark as a module."""
+    yield from load("ablations", "benchmarks")
+
+
+def test_the_ablations_change_one_recipe(ablations: Any) -> None:
+    script = ablations.load_script()
+    full = script.Settings()
+    for variant, changes in ablations.VARIANTS.items():
+        assert (vars(replace(full, **changes)) == vars(full)) == (variant == "full recipe")
+    row = {"model": "VJEPA", "variant": "full recipe", "signal_r2": 1.0, "noise_r2": None, "train_s": 1.0}
+    other = {**row, "signal_r2": 0.5, "noise_r2": 0.25}
+    cells = ablations.table([row, other]).splitlines()[-1].split()
+    assert cells == ["VJEPA", "full", "recipe", "0.7500", "0.5000", "50%", "0.2500", "1.00"]
+    assert ablations.applies("VJEPA", "variance of the head")
+    assert not ablations.applies("JEPA", "variance of the head")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--models", "PCA"], "VAE"),
+        (["--preset", "robust", "--models", "VAE"], "VAE"),
+        (["--entropy", "none", "--entropy-coeff", "1"], "no weight"),
+        (["--heat-steps", "5"], "at least 6"),
+    ],
+)
+def test_the_table_refuses(
+    table: Any, wrong: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         table.parse(wrong)
-    assert "VAE" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_report_with_nan_is_refused(tmp_path: Path) -> None:
