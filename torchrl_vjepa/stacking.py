@@ -13,6 +13,7 @@ __all__ = [
     "columns",
     "features_first",
     "halves",
+    "is_plain_linear",
     "linear",
     "products",
     "shared_noise",
@@ -140,6 +141,23 @@ def halves(x: Tensor) -> tuple[Tensor, Tensor]:
     # The gradient of a chunk is a concatenation, which would put the features last again.
     first, second = x.mT.chunk(2, dim=-2)
     return first.mT, second.mT
+
+
+def is_plain_linear(module: nn.Module) -> bool:
+    """Whether a module is an affine map and nothing else: no subclass, no hook, no parametrisation.
+
+    Args:
+        module: any module.
+
+    Returns:
+        Whether :func:`linear` may be used with its weights in place of calling it.
+
+    Examples:
+        >>> from torch.nn.utils.parametrizations import weight_norm
+        >>> is_plain_linear(nn.Linear(3, 2)), is_plain_linear(weight_norm(nn.Linear(3, 2)))
+        (True, False)
+    """
+    return type(module) is nn.Linear and not (module._forward_hooks or module._forward_pre_hooks)
 
 
 def linear(x: Tensor, weight: Any, bias: Any = None) -> Tensor:
