@@ -509,7 +509,8 @@ def test_partial_reset_starts_only_the_masked_rows_anew():
     second_episode = twin.reset()
     for key in ("observation", "signal", "distractor"):
         assert torch.equal(td[key][~mask], expected["next", key][~mask, 4])
-        assert torch.equal(td[key][mask], second_episode[key][mask])
+        # Observations are products of matrices, whose last digits may depend on the number of rows.
+        torch.testing.assert_close(td[key][mask], second_episode[key][mask])
     after = env.rollout(3, zero_policy, auto_reset=False, tensordict=td)
     assert torch.equal(after["next", "signal"][~mask], expected["next", "signal"][~mask, 5:])
     continued = twin.rollout(3, zero_policy, auto_reset=False, tensordict=second_episode)
