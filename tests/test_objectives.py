@@ -476,8 +476,8 @@ def test_history_encoder(cls: type[JEPA], several: bool) -> None:
 def test_the_scale_may_read_another_entry_than_the_encoder() -> None:
     predictor = Predictor(LATENT, ACTION, skips=SKIPS)
     scale = TargetScale(LATENT, 2, kind="linear")
-    model = VJEPA(linear_encoder(OBS, LATENT), predictor, target_scale=scale, observation_key="light").double()
-    loss = associated(VJEPALoss(model))
+    model = VJEPA(linear_encoder(OBS, LATENT), predictor, target_scale=scale, observation_key="light")
+    loss = associated(VJEPALoss(model.double()))
     windows = make_windows(4, 9)
     with pytest.raises(KeyError, match="light"):
         loss(windows)

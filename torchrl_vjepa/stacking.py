@@ -64,7 +64,7 @@ def shared_noise(like: Tensor, event_dims: int) -> Tensor:
 
 
 def features_first(x: Tensor, steps: slice = slice(None)) -> Tensor:
-    """Windows as rows, with the values of one feature side by side in memory.
+    """Windows as rows; where they are copied, the values of one feature lie side by side in memory.
 
     Latents are short vectors in long columns. Sums over features and products with small matrices run
     along the columns then, several times faster than along the rows.
@@ -74,12 +74,12 @@ def features_first(x: Tensor, steps: slice = slice(None)) -> Tensor:
         steps: which of the ``T`` steps.
 
     Returns:
-        Of shape ``(*N, B T, D)``; a view where the memory is so already.
+        Of shape ``(*N, B T, D)``; a view where the rows are evenly spaced in memory already.
 
     Examples:
         >>> import torch
-        >>> features_first(torch.zeros(2, 3, 4)).stride()
-        (1, 6)
+        >>> features_first(torch.zeros(2, 3, 4), slice(1, None)).stride()
+        (1, 4)
     """
     # Steps are taken after the move: the gradient of a slice has the layout of what was sliced.
     return x.movedim(-1, -3)[..., steps].flatten(-2).mT
