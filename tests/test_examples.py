@@ -313,6 +313,11 @@ def test_help_lists_the_common_options(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_benchmarks_find_what_they_import(path: Path) -> None:
+    runpy.run_path(str(path), run_name="benchmark")
+
+
 def test_script_succeeds_without_warnings(run: Run) -> None:
     assert run.returncode == 0, run.stderr[-4000:]
     assert run.stdout.strip(), "a result is printed"
