@@ -10,12 +10,11 @@ knows the true system.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -32,6 +31,7 @@ from torchrl.modules import get_env_transforms_from_module
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
+from _settings import command_line, option, read_settings
 from torchrl_vjepa import (
     CEM,
     VJEPA,
@@ -65,13 +65,6 @@ STRIDE = 0.4  # distance of a step at full speed
 CALM, GUST, REACH = 0.02, 0.3, 0.35  # standard deviations of the push, and how far from the pit gusts reach
 OBSERVED = 6  # numbers in an observation
 Row = dict[str, Any]
-
-
-def option(default: Any, help: str) -> Any:
-    """A setting with the sentence that --help says about it."""
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata={"help": help})
-    return field(default=default, metadata={"help": help})
 
 
 @dataclass
@@ -366,36 +359,9 @@ def figure(rows: Sequence[Row], walked: dict[tuple[str, str], Tensor], path: Pat
     plt.close(fig)
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Command line: the settings, and where the results go."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    defaults = Settings()
-    for option in fields(Settings):
-        default = getattr(defaults, option.name)
-        many = isinstance(default, list)
-        shown = " ".join(map(str, default)) if many else default
-        parser.add_argument(
-            "--" + option.name.replace("_", "-"),
-            type=type(default[0] if many else default),
-            nargs="+" if many else None,
-            help=f"{option.metadata['help']} (default: {shown})",
-        )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: a test, not a result")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write settings and rows as JSON")
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs"), metavar="FOLDER", help="where the figure goes"
-    )
-    return parser.parse_args(arguments)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
-    args = parse(arguments)
-    given = {option.name: getattr(args, option.name) for option in fields(Settings)}
-    given = {name: value for name, value in given.items() if value is not None}
-    settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
+    settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
     for path in (args.out, args.json.parent if args.json else args.out):
         path.mkdir(parents=True, exist_ok=True)
     # The tensors are small: more threads would only wait for each other.

@@ -8,11 +8,10 @@ they pay, next to the LQG controller that knows the true system.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -30,6 +29,7 @@ from torchrl.modules import get_env_transforms_from_module
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
+from _settings import command_line, option, read_settings
 from torchrl_vjepa import (
     JEPA,
     MPPI,
@@ -78,13 +78,6 @@ STYLES = {
 }
 Row = dict[str, Any]
 Episodes = dict[tuple[str, float], TensorDict]
-
-
-def option(default: Any, help: str) -> Any:
-    """A setting with the sentence that --help says about it."""
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata={"help": help})
-    return field(default=default, metadata={"help": help})
 
 
 @dataclass
@@ -474,36 +467,9 @@ def figure(rows: Sequence[Row], episodes: Episodes, path: Path) -> None:
     plt.close(fig)
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Command line: the settings, and where the results go."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    defaults = Settings()
-    for option in fields(Settings):
-        default = getattr(defaults, option.name)
-        many = isinstance(default, list)
-        shown = " ".join(map(str, default)) if many else default
-        parser.add_argument(
-            "--" + option.name.replace("_", "-"),
-            type=type(default[0] if many else default),
-            nargs="+" if many else None,
-            help=f"{option.metadata['help']} (default: {shown})",
-        )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: a test, not a result")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write settings and rows as JSON")
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs"), metavar="FOLDER", help="where the figure goes"
-    )
-    return parser.parse_args(arguments)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
-    args = parse(arguments)
-    given = {option.name: getattr(args, option.name) for option in fields(Settings)}
-    given = {name: value for name, value in given.items() if value is not None}
-    settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
+    settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
     for path in (args.out, args.json.parent if args.json else args.out):
         path.mkdir(parents=True, exist_ok=True)
     logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes

@@ -15,7 +15,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
+from _settings import command_line, option, read_settings
 from torchrl_vjepa import (
     BJEPA,
     JEPA,
@@ -97,14 +98,6 @@ SHOWN_STEPS = 60
 Row = dict[str, Any]
 
 
-def option(default: Any, help: str, **more: Any) -> Any:
-    """A setting with what --help says about it."""
-    metadata = {"help": help, **more}
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata=metadata)
-    return field(default=default, metadata=metadata)
-
-
 @dataclass
 class Settings:
     """What the run does; every field is a command-line option."""
@@ -163,7 +156,15 @@ class Settings:
     workers: int = option(2, "processes; each trains with one thread")
 
 
-QUICK = {"noise_scales": [0.0, 8.0], "restarts": 3, "workers": 1}
+QUICK = {
+    "noise_scales": [0.0, 8.0],
+    "train_length": 1000,
+    "test_length": 300,
+    "steps": 60,
+    "restarts": 3,
+    "heat_steps": 15,
+    "workers": 1,
+}
 
 
 @dataclass
@@ -691,30 +692,8 @@ def draw(
 
 def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Namespace]:
     """The settings, and where the results go."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    defaults = Settings()
-    for entry in fields(Settings):
-        default = getattr(defaults, entry.name)
-        many = isinstance(default, list)
-        shown = " ".join(map(str, default)) if many else default
-        more = {key: value for key, value in entry.metadata.items() if key != "help"}
-        parser.add_argument(
-            "--" + entry.name.replace("_", "-"),
-            type=type(default[0] if many else default),
-            help=f"{entry.metadata['help']} (default: {shown})",
-            **{"nargs": "+" if many else None, **more},
-        )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: a test, not a result")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write settings and rows as JSON")
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs"), metavar="FOLDER", help="where the figures go"
-    )
-    args = parser.parse_args(arguments)
-    given = {entry.name: getattr(args, entry.name) for entry in fields(Settings)}
-    given = {name: value for name, value in given.items() if value is not None}
-    settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
+    parser = command_line(Settings, __doc__)
+    settings, args = read_settings(parser, Settings, QUICK, arguments)
     if settings.preset == ["robust"] and not set(settings.models) & set(LATENT_MODELS):
         parser.error("VAE and AR have the preset paper only")
     if settings.entropy == "none" and settings.entropy_coeff:

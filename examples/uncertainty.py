@@ -21,7 +21,7 @@ import multiprocessing
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
@@ -34,6 +34,7 @@ from torch.distributions import Distribution
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
+from _settings import command_line, option, read_settings
 from torchrl_vjepa import (
     VJEPA,
     DiagGaussianHead,
@@ -69,14 +70,6 @@ LEVEL = 0.9
 # The filter's covariance has converged and every horizon is compared on the same starts.
 BURN_IN = 10
 Row = dict[str, Any]
-
-
-def option(default: Any, help: str, **more: Any) -> Any:
-    """A setting with what --help says about it."""
-    metadata = {"help": help, **more}
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata=metadata)
-    return field(default=default, metadata=metadata)
 
 
 @dataclass
@@ -508,30 +501,8 @@ def draw(routes: Sequence[Row], shown: dict[float, Shown], settings: Settings, o
 
 def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Namespace]:
     """The settings, and where the results go."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    defaults = Settings()
-    for entry in fields(Settings):
-        default = getattr(defaults, entry.name)
-        many = isinstance(default, list)
-        shown = " ".join(map(str, default)) if many else default
-        more = {key: value for key, value in entry.metadata.items() if key != "help"}
-        parser.add_argument(
-            "--" + entry.name.replace("_", "-"),
-            type=type(default[0] if many else default),
-            help=f"{entry.metadata['help']} (default: {shown})",
-            **{"nargs": "+" if many else None, **more},
-        )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: a test, not a result")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write settings and rows as JSON")
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs"), metavar="FOLDER", help="where the figures go"
-    )
-    args = parser.parse_args(arguments)
-    given = {entry.name: getattr(args, entry.name) for entry in fields(Settings)}
-    given = {name: value for name, value in given.items() if value is not None}
-    settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
+    parser = command_line(Settings, __doc__)
+    settings, args = read_settings(parser, Settings, QUICK, arguments)
     if settings.horizon < 1 or settings.length <= settings.horizon + BURN_IN:
         parser.error(f"--length must be more than --horizon + {BURN_IN}, and --horizon at least 1")
     if settings.window <= max(settings.skips) or settings.length < settings.window:

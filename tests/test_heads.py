@@ -589,3 +589,25 @@ class TestTargetScale:
     def test_errors(self, arguments: dict[str, object], message: str) -> None:
         with pytest.raises(ValueError, match=message):
             TargetScale(**{"latent_dim": 3, **arguments})
+
+
+@pytest.mark.parametrize("name", WITH_DENSITY)
+def test_reading_without_gradients_takes_none_away(name: str) -> None:
+    """What was computed under no_grad or by sample() is not handed out where gradients are wanted."""
+    head = HEADS[name]()
+    features = torch.randn(5, head.num_features(D), requires_grad=True)
+    constants = head.init_constants(D).requires_grad_()
+    target = torch.randn(5, D)
+
+    def gradients(read: Callable[..., object]) -> list[Tensor]:
+        p = head(features, constants)
+        with torch.no_grad():
+            read(p)
+        inputs = [features, constants] if constants.numel() else [features]
+        return list(torch.autograd.grad(p.log_prob(target).sum(), inputs, allow_unused=True))
+
+    expected = gradients(lambda p: None)
+    for read in (lambda p: p.sample(), lambda p: p.log_prob(target), lambda p: p.mean):
+        for got, want in zip(gradients(read), expected, strict=True):
+            if want is not None:
+                torch.testing.assert_close(got, want)

@@ -253,3 +253,64 @@ def test_the_best_models_train_on_in_a_new_loss(case: str) -> None:
     for i, old in enumerate(before):
         new = second.get_model(i).encoder.state_dict()
         assert all((new[key] != value).all() for key, value in old.items())
+
+
+def _vjepa(**changes: Any) -> VJEPA:
+    """A small model; ``changes`` are arguments of its predictor, or its target scale."""
+    scale = changes.pop("target_scale", None)
+    return VJEPA(linear_encoder(6, 3), Predictor(3, **{"skips": (1, 2), **changes}), target_scale=scale)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"skips": (1, 3)},
+        {"residual": True},
+        {"head": DiagGaussianHead(log_var_range=(-2.0, 2.0))},
+        {"target_scale": TargetScale(3, kind="constant")},
+    ],
+    ids=["skips", "residual", "range", "kind of scale"],
+)
+def test_models_that_differ_in_more_than_numbers_are_refused(changes: dict[str, Any]) -> None:
+    """They would all train as the first one."""
+    with pytest.raises(ValueError, match="one architecture, but '.*' is .* in model 1 and .* in model 0"):
+        VJEPALoss([_vjepa(), _vjepa(**changes)])
+
+
+def test_models_may_start_their_scales_anywhere() -> None:
+    scales = [TargetScale(3, kind="constant", init_std=std) for std in (0.1, 1.0)]
+    assert VJEPALoss([_vjepa(target_scale=scale) for scale in scales]).num_models == 2
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+@pytest.mark.parametrize("stacked_data", [False, True])
+def test_stacked_models_equal_mapped_ones(stacked_data: bool, reduction: str) -> None:
+    """Linear models use stacked weights as they are; mapping over the models gives the same numbers."""
+    loss = VJEPALoss(
+        [_vjepa() for _ in range(3)],
+        stacked_data=stacked_data,
+        residual_variance="batch",
+        marginal_entropy_coeff=1.0,
+        reduction=reduction,
+    ).double()
+    SoftUpdate(loss, eps=0.9)
+    shape = (3, 5, 7) if stacked_data else (5, 7)
+    windows = TensorDict(
+        observation=torch.randn(*shape, 6, dtype=torch.float64),
+        is_init=torch.rand(*shape, 1) < 0.1,
+        batch_size=shape,
+    )
+    assert loss._stackable
+    results = []
+    for stackable in (True, False):
+        loss._stackable = stackable
+        torch.manual_seed(3)
+        terms = loss(windows)
+        total = sum(value.sum() for key, value in terms.items() if key.startswith("loss_"))
+        learned = [p for p in loss.parameters() if p.numel()]
+        gradients = torch.autograd.grad(total, learned, allow_unused=True)
+        results.append(({k: v.detach() for k, v in terms.items()}, gradients))
+    torch.testing.assert_close(results[0][0], results[1][0])
+    for stacked, mapped in zip(results[0][1], results[1][1], strict=True):
+        if mapped is not None:
+            torch.testing.assert_close(stacked, mapped)

@@ -509,12 +509,12 @@ def test_partial_reset_starts_only_the_masked_rows_anew():
     second_episode = twin.reset()
     for key in ("observation", "signal", "distractor"):
         assert torch.equal(td[key][~mask], expected["next", key][~mask, 4])
-        # A product of another number of rows may round differently.
+        # Observations are products of matrices, whose last digits may depend on the number of rows.
         torch.testing.assert_close(td[key][mask], second_episode[key][mask])
     after = env.rollout(3, zero_policy, auto_reset=False, tensordict=td)
     assert torch.equal(after["next", "signal"][~mask], expected["next", "signal"][~mask, 5:])
     continued = twin.rollout(3, zero_policy, auto_reset=False, tensordict=second_episode)
-    torch.testing.assert_close(after["next", "signal"][mask], continued["next", "signal"][mask])
+    assert torch.equal(after["next", "signal"][mask], continued["next", "signal"][mask])
 
 
 def test_rows_of_different_length_end_where_they_should():

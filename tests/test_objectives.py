@@ -471,3 +471,17 @@ def test_history_encoder(cls: type[JEPA], several: bool) -> None:
     total(terms).backward()
     parameters = [p for n, p in loss.named_parameters() if n.startswith("encoder_params")]
     assert all(p.grad is not None and p.grad.any() for p in parameters)
+
+
+def test_the_scale_may_read_another_entry_than_the_encoder() -> None:
+    predictor = Predictor(LATENT, ACTION, skips=SKIPS)
+    scale = TargetScale(LATENT, 2, kind="linear")
+    model = VJEPA(linear_encoder(OBS, LATENT), predictor, target_scale=scale, observation_key="light")
+    loss = associated(VJEPALoss(model.double()))
+    windows = make_windows(4, 9)
+    with pytest.raises(KeyError, match="light"):
+        loss(windows)
+    windows["light"] = torch.randn(4, 9, 2, dtype=torch.float64)
+    assert "light" in loss.in_keys
+    expected = (0.5 * (windows["light"] @ scale.linear.weight.mT)).exp().square().mean((0, 1)).sqrt().mean()
+    torch.testing.assert_close(loss(windows)["target_std"], expected.detach(), rtol=1e-5, atol=1e-6)

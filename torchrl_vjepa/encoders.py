@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torchrl.modules import MLP, GRUModule
 
-from torchrl_vjepa.stacking import linear
+from torchrl_vjepa.stacking import is_plain_linear, linear
 from torchrl_vjepa.whitening import Whitening, check_observation, check_size
 
 __all__ = ["history_encoder", "linear_encoder", "mlp_encoder"]
@@ -39,14 +39,14 @@ class _ObservationNetwork(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         dtype = next(self.network.parameters()).dtype
         check_observation(observation, self.observation_dim, self.key, dtype)
-        if isinstance(self.network, nn.Linear):
+        if self.stackable:
             return self._linear(observation)
         return self.network(observation if self.whitening is None else self.whitening(observation))
 
     @property
     def stackable(self) -> bool:
         """Whether weights of several models, stacked, can be used as they are: see ``linear``."""
-        return isinstance(self.network, nn.Linear)
+        return is_plain_linear(self.network)
 
     def _linear(self, observation: Tensor) -> Tensor:
         weight: Any = self.network.weight

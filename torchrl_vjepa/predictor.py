@@ -15,7 +15,7 @@ from torchrl.modules import MLP
 
 from torchrl_vjepa.distributions import point_estimate, product_of_experts
 from torchrl_vjepa.heads import DiagGaussianHead, Head
-from torchrl_vjepa.stacking import linear
+from torchrl_vjepa.stacking import is_plain_linear, linear
 from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.windows import read
 
@@ -295,7 +295,8 @@ class Predictor(_Transition):
                 f"latent, action and side_info must have the dtype of the predictor's weights, {dtype}, "
                 f"got {[item.dtype for item in (latent, action, side_info) if item is not None]}; cast them"
             )
-        features = linear(joined, trunk.weight, trunk.bias) if self.trunk == "linear" else trunk(joined)
+        plain = is_plain_linear(trunk)
+        features = linear(joined, trunk.weight, trunk.bias) if plain else trunk(joined)
         if self.residual:
             features = torch.cat(
                 [features[..., : self.latent_dim] + latent, features[..., self.latent_dim :]],
@@ -308,7 +309,8 @@ class Predictor(_Transition):
     @property
     def stackable(self) -> bool:
         """Whether :meth:`dist` takes the stacked weights of several models (``linear``)."""
-        return self.trunk == "linear" and self.head.stackable and self.temperature is None
+        plain = all(map(is_plain_linear, self.trunks))
+        return plain and self.head.stackable and self.temperature is None
 
     def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
         batch = latent.shape[:-1]

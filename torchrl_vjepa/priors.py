@@ -97,7 +97,8 @@ class GaussianPrior(nn.Module):
             task: not used.
 
         Returns:
-            Distribution with empty batch and event ``(D,)``.
+            Distribution with empty batch and event ``(D,)``; with stacked parameters of ``N``
+            models the batch is ``(N, 1)``, which broadcasts against their rows.
         """
         if hasattr(self, "log_var"):
             mean, log_var = self.mean, self.log_var

@@ -13,6 +13,7 @@ __all__ = [
     "columns",
     "features_first",
     "halves",
+    "is_plain_linear",
     "linear",
     "products",
     "shared_noise",
@@ -63,7 +64,7 @@ def shared_noise(like: Tensor, event_dims: int) -> Tensor:
 
 
 def features_first(x: Tensor, steps: slice = slice(None)) -> Tensor:
-    """Windows as rows, with the values of one feature side by side in memory.
+    """Windows as rows; where they are copied, the values of one feature lie side by side in memory.
 
     Latents are short vectors in long columns. Sums over features and products with small matrices run
     along the columns then, several times faster than along the rows.
@@ -73,12 +74,12 @@ def features_first(x: Tensor, steps: slice = slice(None)) -> Tensor:
         steps: which of the ``T`` steps.
 
     Returns:
-        Of shape ``(*N, B T, D)``; a view where the memory is so already.
+        Of shape ``(*N, B T, D)``; a view where the rows are evenly spaced in memory already.
 
     Examples:
         >>> import torch
-        >>> features_first(torch.zeros(2, 3, 4)).stride()
-        (1, 6)
+        >>> features_first(torch.zeros(2, 3, 4), slice(1, None)).stride()
+        (1, 4)
     """
     # Steps are taken after the move: the gradient of a slice has the layout of what was sliced.
     return x.movedim(-1, -3)[..., steps].flatten(-2).mT
@@ -140,6 +141,23 @@ def halves(x: Tensor) -> tuple[Tensor, Tensor]:
     # The gradient of a chunk is a concatenation, which would put the features last again.
     first, second = x.mT.chunk(2, dim=-2)
     return first.mT, second.mT
+
+
+def is_plain_linear(module: nn.Module) -> bool:
+    """Whether a module is an affine map and nothing else: no subclass, no hook, no parametrisation.
+
+    Args:
+        module: any module.
+
+    Returns:
+        Whether :func:`linear` may be used with its weights in place of calling it.
+
+    Examples:
+        >>> from torch.nn.utils.parametrizations import weight_norm
+        >>> is_plain_linear(nn.Linear(3, 2)), is_plain_linear(weight_norm(nn.Linear(3, 2)))
+        (True, False)
+    """
+    return type(module) is nn.Linear and not (module._forward_hooks or module._forward_pre_hooks)
 
 
 def linear(x: Tensor, weight: Any, bias: Any = None) -> Tensor:

@@ -123,15 +123,23 @@ class DiagGaussian(Independent):
         self.loc = loc
         self._given = spread
         self._is_log_var, self._log_var_range = is_log_var, log_var_range
+        self._bounded: Tensor | None = None
         self.reinterpreted_batch_ndims = 1
         Distribution.__init__(self, batch, loc.shape[-1:], validate_args=False)
 
     @property
     def _spread(self) -> Tensor:
         """Scale or bounded log-variance: a loss that needs the mean alone does not pay for it."""
-        if self._log_var_range is not None:
-            self._given, self._log_var_range = soft_clamp(self._given, *self._log_var_range), None
-        return self._given
+        if self._log_var_range is None:
+            return self._given
+        if self._bounded is not None and self._bounded.requires_grad == self._needs_grad():
+            return self._bounded
+        self._bounded = soft_clamp(self._given, *self._log_var_range)
+        return self._bounded
+
+    def _needs_grad(self) -> bool:
+        # What was computed without gradients must not be handed out where they are wanted.
+        return self._given.requires_grad and torch.is_grad_enabled()
 
     @property
     def base_dist(self) -> Normal:

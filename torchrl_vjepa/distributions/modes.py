@@ -115,8 +115,8 @@ def _ascend(
         _keep_best(record, value.detach(), point.detach())
         objective = torch.where(value.isfinite(), value, 0.0).sum()
         (gradient,) = torch.autograd.grad(-objective, steps)
-        # A row that went astray must not stop the others.
-        steps.grad = gradient.nan_to_num(0.0, 0.0, 0.0)
+        # A row that went astray must not stop the others. LBFGS wants its gradients contiguous.
+        steps.grad = gradient.nan_to_num(0.0, 0.0, 0.0).contiguous()
         return -objective.detach()
 
     optimizer = torch.optim.Adam([steps], lr=0.1) if make_optimizer is None else make_optimizer([steps])

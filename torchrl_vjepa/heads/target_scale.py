@@ -89,7 +89,8 @@ class TargetScale(nn.Module):
             observation: target observation, of shape ``(*B, O)``.
 
         Returns:
-            Of shape ``(*B, D)``; ``(D,)`` where it does not depend on the observation.
+            Of shape ``(*B, D)``; where it does not depend on the observation ``(D,)``, or ``(N, 1, D)`` with
+            the stacked parameters of ``N`` models.
         """
         if self.kind == "linear":
             log_var = linear(observation, self.linear.weight)

@@ -160,11 +160,11 @@ class LatentPredictionLoss(WindowLoss):
     def _target(
         self, outputs: dict[str, Tensor], data: TensorDictBase, params: dict[str, TensorDictBase]
     ) -> Tensor:
-        """What is predicted, ``(B, T, D)``: by default the latents of the target encoder."""
+        """What is predicted, ``(*N, B, T, D)``: by default the latents of the target encoder."""
         return outputs["target"]
 
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
-        """What the member needs of each pair, ``(R, ...)``; mapped over the models."""
+        """What the member needs of each pair: ``(R, ...)`` of one model, ``(N, R, ...)`` of stacked ones."""
         raise TypeError(f"{type(self).__name__} is not a loss by itself: use one of its members")
 
     def _member_terms(self, outputs: dict[str, Tensor], masks: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -48,7 +48,7 @@ class JEPALoss(LatentPredictionLoss):
 
     Examples:
         >>> import torch
-            >>> from tensordict import TensorDict
+        >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
         >>> from torchrl_vjepa import JEPA, DeltaHead, Predictor, linear_encoder
         >>> model = JEPA(linear_encoder(20, 4), Predictor(4, action_dim=2, head=DeltaHead()))

@@ -14,18 +14,18 @@ __all__ = ["Pairs", "mean_over", "rows_of", "second_moment"]
 
 
 class Pairs(NamedTuple):
-    r"""All pairs :math:`(t, t + \Delta)` of one model's windows for one skip, as rows.
+    r"""All pairs :math:`(t, t + \Delta)` of windows for one skip, as rows; of ``*N`` models.
 
     Rows instead of windows: a network that is applied to a matrix, and not to a stack of them, stays one
-    product when several models are mapped over.
+    product when there are several models.
 
     Attributes:
         skip: :math:`\Delta`.
-        dist: predictive distribution with batch ``(R,)``, where ``R = B (T - skip)``.
-        target: target latents, of shape ``(R, D)``.
+        dist: predictive distribution with batch ``(*N, R)``, where ``R = B (T - skip)``.
+        target: target latents, of shape ``(*N, R, D)``.
         context: context latents, of the same shape.
-        action: action chunks ``(R, skip, A)``, or ``None``.
-        side_info: side information ``(R, S)``, or ``None``.
+        action: action chunks ``(*N, R, skip, A)``, or ``None``.
+        side_info: side information ``(*N, R, S)``, or ``None``.
 
     Examples:
         >>> import torch

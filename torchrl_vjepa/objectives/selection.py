@@ -84,7 +84,10 @@ def select_best(
     losses = loss(windows)
     value = losses.get(score, None)
     if value is None:
-        raise KeyError(f"score must be an entry of the losses, one of {list(losses.keys())}, got {score!r}")
+        raise KeyError(
+            f"score must be an entry of the losses, one of {list(losses.keys())}, got {score!r}; after "
+            "select_out_keys call reset_out_keys first"
+        )
     scores: Tensor = value.detach()
     if scores.shape != (loss.num_models,):
         raise ValueError(

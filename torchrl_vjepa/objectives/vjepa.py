@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
@@ -151,6 +151,12 @@ class VJEPALoss(LatentPredictionLoss):
         yield from super()._diagnostic_keys()
         yield from ("target_kl", "target_std", "mutual_information")
         yield from (f"nll_skip_{skip}" for skip in self.predictor.skips)
+
+    def _required_keys(self) -> list[NestedKey]:
+        keys = super()._required_keys()
+        read = self.scale.in_keys[0]
+        # The last key tells the shape of the batch.
+        return keys if read in keys else [keys[0], read, *keys[1:]] if len(keys) > 1 else [read, *keys]
 
     def _target(
         self, outputs: dict[str, Tensor], data: TensorDictBase, params: dict[str, TensorDictBase]

@@ -28,9 +28,9 @@ class WindowLoss(LossModule):
     (``("next", "done")`` or ``is_init``) and padded steps (``loss_mask_key``) count nowhere.
 
     **Several models as one batch.** Given a list of models of the same architecture, the loss trains all
-    of them at once (stacked parameters, ``torch.func.vmap``): its entries get a leading dimension, one
-    number for each model, and their sum gives every model exactly the gradient that it has alone; with
-    Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
+    of them at once (stacked parameters, with ``torch.vmap`` where a module needs it): its entries get a
+    leading dimension, one number for each model, and their sum gives every model exactly the gradient that
+    it has alone; with Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
     are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
     trained one back. This is how restarts and ensembles are trained. A new loss over the best few trains
     them on: many starts a little, few of them longer (successive halving), chosen by the objective. The
@@ -143,14 +143,16 @@ class WindowLoss(LossModule):
             )
         if len({id(m) for m in models}) != len(models):
             raise ValueError("model must be a list of distinct models, got the same one twice; build each")
-        shapes = [
-            {key: value.shape for key, value in m.state_dict().items()} for m in models if len(models) > 1
-        ]
-        for i, other in enumerate(shapes):
-            if other != shapes[0]:
+        blueprints = [_blueprint(m) for m in models if len(models) > 1]
+        for i, other in enumerate(blueprints):
+            different = sorted(
+                key for key in blueprints[0] | other if blueprints[0].get(key) != other.get(key)
+            )
+            if different:
+                key = different[0]
                 raise ValueError(
-                    f"model must be a list of models of one architecture, but the parameters of model {i} "
-                    "differ in name or shape from those of model 0"
+                    f"model must be a list of models of one architecture, but {key!r} is {other.get(key)} in "
+                    f"model {i} and {blueprints[0].get(key)} in model 0; train such models separately"
                 )
         owner: dict[int, int] = {}
         for i, m in enumerate(models if len(models) > 1 else ()):
@@ -200,6 +202,8 @@ class WindowLoss(LossModule):
     def select_out_keys(self, *out_keys: NestedKey) -> WindowLoss:
         """Compute and return these entries only; diagnostics that nobody asks for cost nothing.
 
+        Without diagnostics no :class:`CollapseWarning` is given.
+
         TorchRL's own takes a batch without the optional ``done`` for positional arguments and fails.
 
         Args:
@@ -211,10 +215,11 @@ class WindowLoss(LossModule):
         Raises:
             ValueError: if a key is not among ``out_keys``.
         """
-        self._out_keys = None
-        unknown = [key for key in out_keys if key not in self.out_keys]
-        if unknown or not out_keys:
-            raise ValueError(f"out_keys must be some of {self.out_keys}, got {list(out_keys)}")
+        before, self._out_keys = self._out_keys, None
+        known = self.out_keys
+        if not out_keys or any(key not in known for key in out_keys):
+            self._out_keys = before
+            raise ValueError(f"out_keys must be some of {known}, got {list(out_keys)}")
         self._out_keys = list(out_keys)
         return self
 
@@ -421,7 +426,7 @@ class WindowLoss(LossModule):
         return data, {key: value for key, value in masks.items() if value is not None}
 
     def _encode(self, data: TensorDictBase, params: TensorDictBase, latent_key: NestedKey) -> Tensor:
-        """Latents ``(B, T, D)``, in float32 under autocast."""
+        """Latents ``(*N, B, T, D)``, in float32 under autocast."""
         encoder = self.encoder
         with params.to_module(encoder):
             if type(encoder) is TensorDictModule and encoder.out_keys == [latent_key]:
@@ -475,6 +480,23 @@ class WindowLoss(LossModule):
             return values[0]
         first, *rest = (w * value for w, value in zip(self.skip_weights, values, strict=True))
         return sum(rest, first)
+
+
+def _blueprint(model: torch.nn.Module) -> dict[str, Any]:
+    """What models must share to train as one batch: modules, their settings, shapes of their tensors."""
+    learned = dict(model.named_parameters())
+    blueprint: dict[str, Any] = {
+        f"{name} (tensor)": (tuple(value.shape), "learned" if name in learned else "fixed")
+        for name, value in model.state_dict().items()
+    }
+    for name, module in model.named_modules():
+        blueprint[name] = type(module).__name__
+        for key, value in vars(module).items():
+            # Not where a scale starts: that is a value of the tensor.
+            plain = isinstance(value, (bool, int, float, str, tuple, type(None)))
+            if plain and not key.startswith("_") and key not in ("training", "init_std"):
+                blueprint[f"{name}.{key}" if name else key] = value
+    return blueprint
 
 
 def _normalised(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
