@@ -74,6 +74,7 @@ QUICK_RECIPE = {"train_length": 600, "test_length": 200, "heat_steps": 6, "steps
 
 def load_script() -> ModuleType:
     """The example as a module."""
+    sys.path.insert(0, str(SCRIPT.parent))  # what the scripts share
     spec = importlib.util.spec_from_file_location(SCRIPT.stem, SCRIPT)
     if spec is None or spec.loader is None:
         raise ImportError(f"{SCRIPT} must be a Python script")
