@@ -153,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for name, variant, seed in tqdm(work, leave=False):
         changed = replace(recipe, **VARIANTS[variant])
-        results, _ = script.run_task(("robust", name, seed), changed)
+        results, *_ = script.run_task(("robust", name, (seed,)), changed)
         rows += [{"variant": variant, **row} for row in results]
     wall = time.perf_counter() - start
     print(table(rows))

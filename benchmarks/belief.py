@@ -17,7 +17,7 @@ import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -125,6 +125,11 @@ class Problem:
 
         return lambda: rollout(self.predictor.dist, self.start, self.actions, "sample", num), bare
 
+    def moments(self, method: Literal["linearize", "sigma_points"]) -> Call:
+        """Means and covariances by the library."""
+        given = (self.predictor.dist, self.start, self.actions, method)
+        return lambda: propagate_moments(*given, covariance=self.covariance)
+
     def moments_linearize(self) -> tuple[Call, Call]:
         """The extended Kalman prediction."""
         dim = self.sizes["latent"]
@@ -145,16 +150,7 @@ class Problem:
                 out.append((mean, covariance))
             return torch.stack([m for m, _ in out], 1), torch.stack([c for _, c in out], 1)
 
-        def library() -> tuple[Tensor, Tensor]:
-            return propagate_moments(
-                self.predictor.dist,
-                self.start,
-                self.actions,
-                "linearize",
-                covariance=self.covariance,
-            )
-
-        return library, bare
+        return self.moments("linearize"), bare
 
     def moments_sigma_points(self) -> tuple[Call, Call]:
         """The spherical cubature rule."""
@@ -172,16 +168,7 @@ class Problem:
                 out.append((mean, covariance))
             return torch.stack([m for m, _ in out], 1), torch.stack([c for _, c in out], 1)
 
-        def library() -> tuple[Tensor, Tensor]:
-            return propagate_moments(
-                self.predictor.dist,
-                self.start,
-                self.actions,
-                "sigma_points",
-                covariance=self.covariance,
-            )
-
-        return library, bare
+        return self.moments("sigma_points"), bare
 
     def make_filter(self, **kwargs: Any) -> ParticleFilter:
         """The filter that is measured; it resamples every row at every step."""

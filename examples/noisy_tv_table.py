@@ -96,6 +96,9 @@ EMA_DECAY, BETA, GAMMA = 0.99, 0.01, 0.1
 INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0
 SHOWN_STEPS = 60
 Row = dict[str, Any]
+Task = tuple[str, str, tuple[int, ...]]  # preset, model, seeds that train as one batch
+# By the time that they take, so that the processes end together.
+SLOWEST_FIRST = ["BJEPA", "VJEPA", "VAE", "JEPA", "AR"]
 
 
 @dataclass
@@ -153,6 +156,9 @@ class Settings:
     window: int = option(20, "robust: steps in a window, more than the largest skip")
     windows: int = option(24, "robust: windows in a batch")
     lr: float = option(0.0, "peak learning rate; 0 is 0.001 (paper) or 0.3 (robust)")
+    seeds_per_batch: int = option(
+        1, "seeds that train as one batch, with all their scales and restarts; 0 for all: same numbers"
+    )
     workers: int = option(2, "processes; each trains with one thread")
 
 
@@ -478,37 +484,36 @@ def probe(latents: Sequence[Tensor], run: Run, ahead: int, average: str) -> tupl
     return scores, curve[:SHOWN_STEPS]
 
 
-def run_task(task: tuple[str, str, int], settings: Settings) -> tuple[list[Row], dict[Any, Any]]:
-    """One model kind on all noise scales of one seed: rows, and what the figures show."""
-    preset, name, seed = task
+def run_task(task: Task, settings: Settings) -> tuple[list[Row], dict[Any, Any], list[Row]]:
+    """One model kind on all noise scales of some seeds: rows, what the figures show, what fusion changes."""
+    preset, name, seeds = task
     torch.set_num_threads(1)
-    runs = Run.simulate(seed, settings)
+    runs = [run for seed in seeds for run in Run.simulate(seed, settings)]
     normalisation = "standard" if preset == "paper" else settings.normalisation
     start = time.perf_counter()
     train = train_paper if preset == "paper" else train_robust
     models = list(train(name, runs, settings))
     seconds = (time.perf_counter() - start) / len(runs)
-    rows, shown = [], {}
+    rows, shown, fusion = [], {}, []
     for run, model in zip(runs, models, strict=True):
-        outputs = [represent(name, model, observations) for observations in run.normalise(normalisation)]
-        scores, predicted = probe(
-            [latent for latent, _ in outputs], run, 0 if name == "VAE" else 1, settings.r2
-        )
+        data = run.normalise(normalisation)
+        outputs = [represent(name, model, observations) for observations in data]
+        ahead = 0 if name == "VAE" else 1
+        scores, predicted = probe([latent for latent, _ in outputs], run, ahead, settings.r2)
+        which = {"preset": preset, "noise_scale": run.noise_scale, "seed": run.seed}
         rows.append(
-            {
-                "preset": preset,
-                "model": name,
-                "encoder": settings.encoder,
-                "noise_scale": run.noise_scale,
-                "seed": seed,
-                **scores,
-                "train_s": seconds,
-            }
+            {**which, "model": name, "encoder": settings.encoder, **scores, "train_s": seconds},
         )
+        if name == "BJEPA":
+            # A VJEPA is a BJEPA without its prior.
+            unfused = [represent("VJEPA", model, observations)[0] for observations in data]
+            alone = probe(unfused, run, ahead, settings.r2)[0]["signal_r2"]
+            fusion.append({**which, "fused": scores["signal_r2"], "unfused": alone})
         latents, variances = outputs[1]
         relative = None if variances is None else variances.mean(0) / latents.var(0)
-        shown[preset, name, run.noise_scale] = (predicted[:, 0], relative)
-    return rows, shown
+        if run.seed == settings.seeds[0]:
+            shown[preset, name, run.noise_scale] = (predicted[:, 0], relative)
+    return rows, shown, fusion
 
 
 def oracles(seed: int, settings: Settings) -> list[Row]:
@@ -711,13 +716,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # The tensors are small: a second process helps, a second thread would only wait.
     torch.set_num_threads(1)
     start = time.perf_counter()
-    # The slowest first, so that the processes end together.
-    tasks = [
-        (preset, name, seed)
+    size = settings.seeds_per_batch or len(settings.seeds)
+    batches = [tuple(settings.seeds[i : i + size]) for i in range(0, len(settings.seeds), size)]
+    tasks: list[Task] = [
+        (preset, name, seeds)
         for preset in settings.preset
-        for name in reversed(MODELS)
+        for name in SLOWEST_FIRST
         if name in settings.models and (preset == "paper" or name in LATENT_MODELS)
-        for seed in settings.seeds
+        for seeds in batches
     ]
     work = [
         *((run_task, task, settings) for task in tasks),
@@ -729,18 +735,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     order = {name: i for i, name in enumerate(MODELS)}
     rows = sum((result[0] for result in results[: len(tasks)]), [])
     rows.sort(key=lambda r: (r["preset"], r["seed"], r["noise_scale"], order[r["model"]]))
+    fusion = sum((result[2] for result in results[: len(tasks)]), [])
     for preset in settings.preset:
         mine = [row for row in rows if row["preset"] == preset]
+        if not mine:
+            print(f"Preset {preset} has none of the models {settings.models}\n")
+            continue
         shown = {}
-        for (kind, _, seed), (_, curves) in zip(tasks, results, strict=False):
-            if kind == preset and seed == settings.seeds[0]:
+        for (kind, _, _), (_, curves, _) in zip(tasks, results, strict=False):
+            if kind == preset:
                 shown |= curves
         print(f"Preset {preset}, {settings.encoder} encoder, {len(settings.seeds)} seed(s)\n")
         print(table([*mine, *ideal], settings))
+        gains = [row["fused"] - row["unfused"] for row in fusion if row["preset"] == preset]
+        if gains:
+            print(f"\nBJEPA, signal R2 fused minus unfused: {min(gains):+.4f} to {max(gains):+.4f}")
         print("\nfigures:", *draw(preset, mine, ideal, shown, settings, args.out), end="\n\n")
     print(f"{len(rows)} runs in {wall:.0f} s")
     if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows}
+        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows, "fusion": fusion}
         args.json.write_text(json.dumps(result, indent=1))
 
 

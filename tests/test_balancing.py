@@ -157,6 +157,24 @@ def formed(kind: type[VJEPA], std: float, trunk: float = A) -> VJEPA:
     return model
 
 
+def update(
+    loss: VJEPALoss,
+    windows: TensorDict,
+    optimizer: torch.optim.Optimizer,
+    updater: SoftUpdate,
+    balancers: Sequence[AdaptiveCoefficient],
+) -> TensorDict:
+    """One step of everything; the losses before it."""
+    losses = loss(windows)
+    optimizer.zero_grad()
+    sum(value.sum() for name, value in losses.items() if name.startswith("loss_")).backward()
+    optimizer.step()
+    updater.step()
+    for balancer in balancers:
+        balancer.step(losses)
+    return losses
+
+
 def train(
     loss: VJEPALoss,
     parameters: Any,
@@ -174,13 +192,7 @@ def train(
     generator = generator or torch.Generator().manual_seed(0)
     history = []
     for _ in range(steps):
-        losses = loss(signal_and_noise(64, 5, generator))
-        optimizer.zero_grad()
-        sum(value.sum() for name, value in losses.items() if name.startswith("loss_")).backward()
-        optimizer.step()
-        updater.step()
-        for balancer in balancers:
-            balancer.step(losses)
+        losses = update(loss, signal_and_noise(64, 5, generator), optimizer, updater, balancers)
         history.append(losses[key])
     return torch.stack(history)
 
@@ -289,13 +301,7 @@ def test_models_of_a_list_are_balanced_as_each_alone() -> None:
         for step in range(5):
             windows = signal_and_noise(8, 5, generator).double()
             torch.manual_seed(step)
-            losses = loss(windows)
-            optimizer.zero_grad()
-            sum(value.sum() for name, value in losses.items() if name.startswith("loss_")).backward()
-            optimizer.step()
-            updater.step()
-            for balancer in balancers:
-                balancer.step(losses)
+            update(loss, windows, optimizer, updater, balancers)
         return loss, torch.stack([loss.target_kl_coeff, loss.structural_kl_coeff])
 
     starts = [(0.3, 0.5), (0.8, 0.9), (0.1, 0.2)]

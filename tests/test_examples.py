@@ -157,9 +157,16 @@ def check_report(report: dict[str, Any]) -> None:
 
 def check_table_report(report: dict[str, Any]) -> None:
     """Checks the report of ``noisy_tv_table.py``: its keys, its types, and one row for each run."""
-    assert set(report) == {"settings", "wall_s", "rows"}
+    assert set(report) == {"settings", "wall_s", "rows", "fusion"}
     settings, rows = report["settings"], report["rows"]
     assert report["wall_s"] > 0
+    fused = [row for row in rows if row["model"] == "BJEPA"]
+    signal_r2 = {(r["preset"], r["noise_scale"], r["seed"]): r["signal_r2"] for r in fused}
+    assert len(report["fusion"]) == len(signal_r2)
+    for row in report["fusion"]:
+        assert row["fused"] == signal_r2[row["preset"], row["noise_scale"], row["seed"]]
+        # With constant variances fusion moves the mean by an affine map, which the probe undoes.
+        assert row["preset"] == "paper" or row["fused"] > row["unfused"] - 0.005
     cells = [(row["preset"], row["model"], row["noise_scale"], row["seed"]) for row in rows]
     latent = [name for name in settings["models"] if "JEPA" in name]
     expected = {
@@ -304,6 +311,11 @@ def test_help_lists_the_common_options(
         assert re.search(rf"{option}\b", shown), option
     assert re.search(r"--seeds?\b", shown)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_benchmarks_find_what_they_import(path: Path) -> None:
+    runpy.run_path(str(path), run_name="benchmark")
 
 
 def test_script_succeeds_without_warnings(run: Run) -> None:
@@ -541,10 +553,12 @@ def table() -> Any:
     [("paper", "VAE"), ("paper", "AR"), ("paper", "VJEPA"), ("robust", "JEPA"), ("robust", "BJEPA")],
 )
 def test_a_run_does_not_depend_on_the_others(table: Any, preset: str, name: str, encoder: str) -> None:
-    alone, _ = table.run_task((preset, name, 0), table_settings(table, encoder=encoder))
+    alone, *_ = table.run_task((preset, name, (0,)), table_settings(table, encoder=encoder))
     settings = table_settings(table, encoder=encoder, noise_scales=[0.0, 2.0, 8.0])
-    together, _ = table.run_task((preset, name, 0), settings)
-    assert [row["noise_scale"] for row in together] == [0.0, 2.0, 8.0]
+    together, *_ = table.run_task((preset, name, (1, 0)), settings)
+    assert [(row["seed"], row["noise_scale"]) for row in together] == [
+        (seed, scale) for seed in (1, 0) for scale in (0.0, 2.0, 8.0)
+    ]
     for key in ("signal_r2_train", "signal_r2", "noise_r2_train", "noise_r2"):
         assert together[-1][key] == pytest.approx(alone[0][key], abs=1e-3)
 
@@ -657,7 +671,7 @@ def test_cca_finds_the_signal_without_labels(table: Any) -> None:
 @pytest.fixture(scope="module")
 def full_recipe(table: Any) -> dict[str, Any]:
     """A row of the robust preset."""
-    (row,), _ = table.run_task(("robust", "VJEPA", 0), table_settings(table))
+    (row,), *_ = table.run_task(("robust", "VJEPA", (0,)), table_settings(table))
     return row
 
 
@@ -681,7 +695,7 @@ def full_recipe(table: Any) -> dict[str, Any]:
 def test_every_ingredient_of_the_robust_recipe_can_be_changed(
     table: Any, full_recipe: dict[str, Any], change: dict[str, Any]
 ) -> None:
-    (changed,), _ = table.run_task(("robust", "VJEPA", 0), table_settings(table, **change))
+    (changed,), *_ = table.run_task(("robust", "VJEPA", (0,)), table_settings(table, **change))
     assert math.isfinite(changed["signal_r2"])
     assert changed["signal_r2"] != full_recipe["signal_r2"]
 

@@ -30,12 +30,12 @@ class WindowLoss(LossModule):
     **Several models as one batch.** Given a list of models of the same architecture, the loss trains all
     of them at once (stacked parameters, with ``torch.vmap`` where a module needs it): its entries get a
     leading dimension, one number for each model, and their sum gives every model exactly the gradient that
-    it has alone; with Adam, and with ``SoftUpdate``, the models train as if they were alone. The random numbers of a step
-    are shared by the models, so adding or removing one changes no other. :meth:`get_model` hands a
-    trained one back. This is how restarts and ensembles are trained. A new loss over the best few trains
-    them on: many starts a little, few of them longer (successive halving), chosen by the objective. The
-    models share the coefficients of the loss, unless a coefficient's buffer has shape ``(num_models,)``:
-    one number for each model.
+    it has alone; with Adam, and with ``SoftUpdate``, the models train as if they were alone. The random
+    numbers of a step are shared by the models, so adding or removing one changes no other.
+    :meth:`get_model` hands a trained one back. This is how restarts and ensembles are trained. A new loss
+    over the best few trains them on: many starts a little, few of them longer (successive halving), chosen
+    by the objective. The models share the coefficients of the loss, unless a coefficient's buffer has
+    shape ``(num_models,)``: one number for each model.
 
     Args:
         model: the model, or a list of models.
