@@ -8,7 +8,7 @@ and to the distractor, over all seeds and noise scales. One process, one thread.
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import importlib
 import json
 import sys
 import time
@@ -73,15 +73,10 @@ QUICK_RECIPE = {"train_length": 600, "test_length": 200, "heat_steps": 6, "steps
 
 
 def load_script() -> ModuleType:
-    """The example as a module."""
-    sys.path.insert(0, str(SCRIPT.parent))  # what the scripts share
-    spec = importlib.util.spec_from_file_location(SCRIPT.stem, SCRIPT)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{SCRIPT} must be a Python script")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    """The example as a module, which finds what the scripts share beside it."""
+    if str(SCRIPT.parent) not in sys.path:
+        sys.path.insert(0, str(SCRIPT.parent))
+    return importlib.import_module(SCRIPT.stem)
 
 
 def applies(name: str, variant: str) -> bool:

@@ -250,9 +250,11 @@ def _gaussian_kl(p: Distribution, q: Distribution) -> Tensor:
 
 def _diagonal_kl(p: DiagGaussian, q: DiagGaussian) -> Tensor:
     """From the log-variances: what the heads give, without a root or a logarithm."""
-    log_ratio = columns(p.log_var) - columns(q.log_var)
-    mahalanobis = columns(p.loc - q.loc).square() * columns(q.precision)
-    kl = 0.5 * (log_ratio.exp() - 1 - log_ratio + mahalanobis).sum(-2)
+    deviation, log_var = columns(p.loc - q.loc), columns(p.log_var)
+    second_moment = torch.addcmul(log_var.exp(), deviation, deviation)
+    terms = torch.addcmul(-log_var, second_moment, columns(q.precision))
+    constant = columns(q.log_var).sum(-2) - p.event_shape[0]
+    kl = 0.5 * (terms.sum(-2) + constant)
     return kl if p.loc.ndim > 1 or q.loc.ndim > 1 else kl.squeeze(-1)
 
 
