@@ -401,7 +401,7 @@ def valid_table() -> dict[str, Any]:
                     "train_s": 1.0,
                 }
             )
-    return {"settings": settings, "wall_s": 1.0, "rows": rows}
+    return {"settings": settings, "wall_s": 1.0, "rows": rows, "fusion": []}
 
 
 def test_the_table_check_accepts_a_valid_report() -> None:

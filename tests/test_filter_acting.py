@@ -339,8 +339,14 @@ def test_cost_of_a_belief_is_the_mean_over_its_particles() -> None:
     plans = torch.tensor([[[0.0]], [[-0.5]], [[1.0]]])
     expected = (0.25 * (-1 + plans) ** 2 + 0.5 * plans**2 + 0.25 * (3 + plans) ** 2).flatten()
     torch.testing.assert_close(env.objective(state, plans), expected)
-    worst = world(num_samples=4, risk=lambda costs: costs.amax(0))
+    worst = world(num_samples=4, how="sample", risk=lambda costs: costs.amax(0))
     torch.testing.assert_close(worst.objective(state, plans), torch.tensor([9.0, 6.25, 16.0]))
+    with pytest.raises(ValueError, match="how must be 'sample' for a risk or a constraint"):
+        world(num_samples=4, risk=lambda costs: costs.amax(0))
+    for weights in (torch.full((4,), math.nan), torch.full((4,), -math.inf)):
+        bad = TensorDict(belief=TensorDict(particles=particles, log_weights=weights))
+        with pytest.raises(ValueError, match="some weight in every row"):
+            env.planning_state(bad)
 
 
 def test_what_follows_a_particle_is_the_point_that_was_asked_for() -> None:

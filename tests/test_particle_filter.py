@@ -13,7 +13,13 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal, StudentT
 
-from torchrl_vjepa.belief import LinearObservation, ParticleBelief, ParticleFilter, PseudoLikelihood
+from torchrl_vjepa.belief import (
+    LinearObservation,
+    ParticleBelief,
+    ParticleFilter,
+    PseudoLikelihood,
+    systematic_resampling,
+)
 from torchrl_vjepa.distributions import Delta, diag_gaussian, product_of_experts
 from torchrl_vjepa.encoders import linear_encoder
 from torchrl_vjepa.heads import TargetScale
@@ -583,8 +589,34 @@ def test_bad_shapes_are_refused() -> None:
             torch.zeros(3, 2)
         )
     run.initial = diag_gaussian(torch.zeros(5), torch.ones(5))
-    with pytest.raises(ValueError, match=r"initial must have event shape \(2,\), got \(5,\)"):
+    with pytest.raises(
+        ValueError, match=r"initial must have no batch and event shape \(2,\), got \(\) and \(5,\)"
+    ):
         run.start(torch.zeros(3, 2))
     run.initial, run.proposal = None, lambda p, x: diag_gaussian(x, torch.ones(1))
     with pytest.raises(ValueError, match=r"proposal must give draws of shape \(3, 4, 2\), got \(3, 1, 2\)"):
         run.start(torch.zeros(3, 2))
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("bad", [math.nan, -math.inf])
+def test_weights_that_were_lost_count_the_same_again(bad: float, threshold: float) -> None:
+    """A belief that comes without weight in a row is not taken for its last particle."""
+    predictor = Predictor(1, action_dim=1)
+    run = ParticleFilter(
+        predictor,
+        lambda observation, latent: -(observation - latent).square().sum(-1),
+        num_particles=4,
+        resample_threshold=threshold,
+        generator=torch.Generator().manual_seed(0),
+    )
+    particles = torch.arange(8.0).reshape(2, 4, 1)
+    weights = torch.stack([torch.full((4,), bad), torch.zeros(4)])
+    with pytest.warns(RuntimeWarning, match="weights that 1 of 2 beliefs came with"):
+        moved, evidence = run.step(
+            ParticleBelief(particles, weights, validate_args=False), torch.zeros(2, 1), torch.zeros(2, 1)
+        )
+    assert evidence.isfinite().all()
+    assert moved.log_weights.isfinite().all()
+    with pytest.raises(ValueError, match="some weight in every row"):
+        systematic_resampling(weights)

@@ -12,9 +12,17 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.distributions import Normal
+from torch.distributions import Distribution, Normal
+from torchrl.data import Bounded
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import RewardScaling
 
+from torchrl_vjepa.costs import quadratic_cost
+from torchrl_vjepa.distributions import diag_gaussian
+from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.planners import CEM, MPPI
 from torchrl_vjepa.risk import (
     REJECTED_COST,
     ChanceConstraint,
@@ -502,3 +510,33 @@ class TestSampling:
     def test_defaults(self) -> None:
         assert Sampling.checked(None, None, []) == (None, expectation, ())
         assert Sampling.checked(3, worst_case, []) == (3, worst_case, ())
+
+
+@pytest.mark.parametrize("planner_class", [CEM, MPPI])
+def test_a_mean_that_breaks_a_constraint_is_not_executed(planner_class: type) -> None:
+    """Plans on both sides of a forbidden zone are feasible, their mean is not."""
+
+    def move(latent: Tensor, action: Tensor) -> Distribution:
+        return diag_gaussian(latent + action, torch.full_like(latent, 0.01))
+
+    forbidden = ChanceConstraint(lambda latent, action: latent.squeeze(-1).abs() < 0.4, 0.05)
+    env = LatentEnv(move, action_spec=Bounded(-1, 1, (1,)), cost=quadratic_cost(torch.zeros(1)), latent_dim=1)
+    planner = planner_class(
+        env, planning_horizon=1, num_candidates=256, num_samples=64, constraints=[forbidden], seed=0
+    )
+    action = planner(TensorDict(latent=torch.zeros(5, 1), batch_size=5))["action"]
+    assert (action.abs() > 0.4).all()
+
+
+def test_what_stepping_would_ignore_is_refused() -> None:
+    def move(latent: Tensor, action: Tensor) -> Distribution:
+        return diag_gaussian(latent + action, torch.ones_like(latent))
+
+    spec, cost = Bounded(-1, 1, (1,)), quadratic_cost(torch.zeros(1))
+    env = LatentEnv(
+        move, action_spec=spec, cost=cost, latent_dim=1, how="sample", num_samples=8, risk=cvar(0.5)
+    )
+    with pytest.raises(ValueError, match="which stepping would ignore"):
+        CEM(TransformedEnv(env, RewardScaling(0.0, 2.0)), planning_horizon=1)
+    with pytest.raises(ValueError, match="num_samples must be at least 2 for a risk"):
+        LatentEnv(move, action_spec=spec, cost=cost, latent_dim=1, how="sample", risk=cvar(0.5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from collections.abc import Callable
 
@@ -290,7 +291,7 @@ def test_the_likelihood_of_a_loss_feels_it_and_models_of_a_list_have_their_own()
     torch.testing.assert_close(after, torch.stack([nll(model) for model in models]))
     # Models with and without one are not of one architecture.
     models[0].predictor.set_temperature(None)
-    with pytest.raises(ValueError, match="differ in name or shape"):
+    with pytest.raises(ValueError, match="one architecture"):
         VJEPALoss(models)
 
 
@@ -330,3 +331,9 @@ def test_the_predictor_refuses(wrong: list[float]) -> None:
     with pytest.raises(ValueError, match="temperature must"):
         predictor.set_temperature(wrong)
     assert predictor.temperature is None
+
+
+@pytest.mark.parametrize("temperature", [-1.0, 0.0, math.nan, math.inf])
+def test_temperatures_that_are_not_positive_are_refused(temperature: float) -> None:
+    with pytest.raises(ValueError, match="temperature must be positive and finite"):
+        temper(diag_gaussian(torch.zeros(2), torch.ones(2)), temperature)

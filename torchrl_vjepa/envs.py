@@ -18,14 +18,17 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
-from torchrl_vjepa.belief import rollout, systematic_resampling
+from torchrl_vjepa.belief import resampling_index, rollout
 from torchrl_vjepa.common_random_numbers import CommonNoise
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.latent_step import LatentStep
-from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, plan_cost
+from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 
 __all__ = ["LatentEnv"]
+
+#: Trajectories per plan where a belief is given and no number: one particle would be a matter of luck.
+BELIEF_SAMPLES = 64
 
 
 class LatentEnv(ModelBasedEnvBase):
@@ -52,8 +55,8 @@ class LatentEnv(ModelBasedEnvBase):
             ``(*B, 1)``. Either this or ``cost``.
         cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; the reward is minus the cost.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
-        num_samples: trajectories ``M`` per candidate plan for ``how="sample"``, or from ``M`` particles
-            of a belief with any ``how``. They share their
+        num_samples: trajectories ``M`` per candidate plan for ``how="sample"`` (1 by default), or from ``M``
+            particles of a belief with any ``how`` (64 by default). They share their
             random numbers across candidates and across the batch (common random numbers: the ranking
             of plans does not depend on luck), as far as
             :func:`~torchrl_vjepa.common_random_numbers.sample_common` knows the distribution.
@@ -104,7 +107,7 @@ class LatentEnv(ModelBasedEnvBase):
         reward_model: TensorDictModuleBase | None = None,
         cost: StageCost | None = None,
         how: Literal["mean", "mode", "sample"] = "mean",
-        num_samples: int = 1,
+        num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] = (),
         latent_dim: int | None = None,
@@ -123,6 +126,8 @@ class LatentEnv(ModelBasedEnvBase):
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
         sampled = how == "sample" or belief_key is not None
+        if num_samples is None:
+            num_samples = 1 if belief_key is None else BELIEF_SAMPLES
         if num_samples < 1 or (num_samples > 1 and not sampled):
             raise ValueError(
                 "num_samples must be at least 1, and 1 unless how='sample', "
@@ -182,6 +187,7 @@ class LatentEnv(ModelBasedEnvBase):
             device=self.device,
         )
         world_model.probe(latent_dim, action_dim, self.device, dtype)
+        self.sampling()  # refuses what does not go together
 
     def planning_state(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
         """Where imagination starts: the latent or the belief, and nothing else of the input.
@@ -214,6 +220,16 @@ class LatentEnv(ModelBasedEnvBase):
             )
         if self.belief_key is None:
             return start
+        if values[1].shape != start.shape[:-1]:
+            raise ValueError(
+                f"{self.planning_keys[1]!r} must have shape {tuple(start.shape[:-1])}, one for each "
+                f"particle, got {tuple(values[1].shape)}"
+            )
+        if not bool(values[1].logsumexp(-1).isfinite().all()):
+            raise ValueError(
+                f"{self.planning_keys[1]!r} must hold some weight in every row, got rows that are all "
+                "zero or nan"
+            )
         names = ("particles", "log_weights")
         return TensorDict(dict(zip(names, values, strict=True)), batch_size=start.shape[:-2])
 
@@ -239,11 +255,18 @@ class LatentEnv(ModelBasedEnvBase):
         """
         sampled = self.how == "sample" or self.belief_key is not None
         own = self.num_samples if sampled else None
-        return Sampling.checked(
+        settings = Sampling.checked(
             own if num_samples is None else num_samples,
             self.risk if risk is None else risk,
             self.constraints if constraints is None else constraints,
         )
+        judged = settings.constraints or settings.risk is not expectation
+        if judged and self.belief_key is not None and self.how != "sample":
+            raise ValueError(
+                "how must be 'sample' for a risk or a constraint on plans that start from a belief, got "
+                f"{self.how!r}: it would leave out the noise of the transitions"
+            )
+        return settings
 
     def objective(
         self,
@@ -385,7 +408,7 @@ class LatentEnv(ModelBasedEnvBase):
 
 def _drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:
     """Particles ``(M, *B, D)`` of a belief, by one random number for all rows, as all planning noise."""
-    index = systematic_resampling(
+    index = resampling_index(
         belief.get("log_weights"), num_samples, shared=True, generator=generator
     ).unsqueeze(-1)
     particles = belief.get("particles")

@@ -385,6 +385,11 @@ class Sampling(NamedTuple):
                 "got a point prediction; give num_samples to the planner, or how='sample' and num_samples "
                 "to LatentEnv"
             )
+        if num_samples == 1 and (risk not in (None, expectation) or len(constraints)):
+            raise ValueError(
+                "num_samples must be at least 2 for a risk or a constraint, which read a distribution of "
+                "trajectories, got 1"
+            )
         return cls(num_samples, expectation if risk is None else risk, tuple(constraints))
 
 

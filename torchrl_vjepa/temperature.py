@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -45,7 +46,8 @@ def temper(p: Distribution, temperature: Tensor | float) -> Distribution:
         Distribution with the same shapes.
 
     Raises:
-        ValueError: if the event is not ``(D,)`` or the temperature is not a scalar.
+        ValueError: if the event is not ``(D,)``, or the temperature is no scalar or a number that is not
+            positive (the value of a tensor is not looked at).
         TypeError: if ``p`` has no mean.
 
     Examples:
@@ -58,6 +60,8 @@ def temper(p: Distribution, temperature: Tensor | float) -> Distribution:
         raise ValueError(f"p must have event shape (D,), got {tuple(p.event_shape)}")
     if isinstance(temperature, Tensor) and temperature.ndim:
         raise ValueError(f"temperature must be a scalar, got shape {tuple(temperature.shape)}")
+    if not isinstance(temperature, Tensor) and not 0 < temperature < math.inf:
+        raise ValueError(f"temperature must be positive and finite, got {temperature}")
     if isinstance(p, Delta):
         return p
     try:

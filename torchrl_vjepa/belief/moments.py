@@ -153,11 +153,12 @@ def _checked_covariance(covariance: Tensor, latent: Tensor) -> Tensor:
         ) from None
     if not covariance.isfinite().all():
         raise ValueError("covariance must be finite, got NaN or infinite entries")
-    scale = covariance.abs().amax()
+    scale = covariance.abs().amax((-2, -1))
     tolerance = 100 * dim * torch.finfo(covariance.dtype).eps * scale
-    if (covariance - covariance.mT).abs().amax() > tolerance:
+    if ((covariance - covariance.mT).abs().amax((-2, -1)) > tolerance).any():
         raise ValueError("covariance must be symmetric, got an asymmetric matrix")
-    lowest = torch.linalg.eigvalsh(covariance).amin()
-    if lowest < -tolerance:
-        raise ValueError(f"covariance must be positive semi-definite, got the eigenvalue {float(lowest):.3g}")
+    lowest = torch.linalg.eigvalsh(covariance).amin(-1)
+    if (lowest < -tolerance).any():
+        worst = float(lowest[lowest < -tolerance].min())
+        raise ValueError(f"covariance must be positive semi-definite, got the eigenvalue {worst:.3g}")
     return full

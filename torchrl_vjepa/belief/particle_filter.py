@@ -18,7 +18,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl_vjepa.belief.particles import (
     ParticleBelief,
     effective_sample_size,
-    systematic_resampling,
+    resampling_index,
 )
 from torchrl_vjepa.distributions import diag_gaussian, sample
 from torchrl_vjepa.generators import pack_generator, unpack_generator
@@ -221,9 +221,10 @@ class ParticleFilter(TensorDictModuleBase):
             initial = diag_gaussian(zeros, torch.ones_like(zeros[:1]))
         elif not isinstance(initial, Distribution):
             initial = initial()
-        if tuple(initial.event_shape) != (self.latent_dim,):
+        if tuple(initial.event_shape) != (self.latent_dim,) or initial.batch_shape:
             raise ValueError(
-                f"initial must have event shape {(self.latent_dim,)}, got {tuple(initial.event_shape)}"
+                f"initial must have no batch and event shape {(self.latent_dim,)}, got "
+                f"{tuple(initial.batch_shape)} and {tuple(initial.event_shape)}"
             )
         prior = initial
         parts = [self._weighed(prior.expand((*batch, num)), observation) for _, num in self._chunks()]
@@ -417,11 +418,20 @@ class ParticleFilter(TensorDictModuleBase):
 
     def _resampled(self, belief: ParticleBelief) -> tuple[Tensor, Tensor]:
         particles, log_weights = belief.particles, belief.log_weights
+        lost = ~log_weights.logsumexp(-1).isfinite()
+        if bool(lost.any()):
+            warnings.warn(
+                f"the weights that {int(lost.sum())} of {lost.numel()} beliefs came with are all zero or "
+                "nan: their particles count the same again",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+            log_weights = torch.where(lost.unsqueeze(-1), -math.log(self.num_particles), log_weights)
         if self.resample_threshold == 0:
             return particles, log_weights
         num = self.num_particles
         keep = effective_sample_size(log_weights) >= self.resample_threshold * num
-        index = systematic_resampling(log_weights, generator=self.generator)
+        index = resampling_index(log_weights, generator=self.generator)
         rows = keep.unsqueeze(-1)
         index = torch.where(rows, torch.arange(num, device=index.device), index)
         particles = particles.gather(-2, index.unsqueeze(-1).expand(particles.shape))

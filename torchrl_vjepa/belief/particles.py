@@ -68,9 +68,37 @@ def systematic_resampling(
         tensor([0, 0, 2, 3])
     """
     _check_particles(log_weights, "log_weights")
-    num = log_weights.shape[-1] if num_samples is None else num_samples
-    if num < 1:
+    if num_samples is not None and num_samples < 1:
         raise ValueError(f"num_samples must be positive, got {num_samples}")
+    if not bool(log_weights.logsumexp(-1).isfinite().all()):
+        raise ValueError("log_weights must hold some weight in every row, got rows that are all zero or nan")
+    return resampling_index(log_weights, num_samples, shared=shared, generator=generator)
+
+
+def resampling_index(
+    log_weights: Tensor,
+    num_samples: int | None = None,
+    *,
+    shared: bool = False,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """:func:`systematic_resampling` without its checks, which look at values: for weights that were checked.
+
+    Args:
+        log_weights: see :func:`systematic_resampling`.
+        num_samples: see :func:`systematic_resampling`.
+        shared: see :func:`systematic_resampling`.
+        generator: see :func:`systematic_resampling`.
+
+    Returns:
+        See :func:`systematic_resampling`.
+
+    Examples:
+        >>> import torch
+        >>> resampling_index(torch.tensor([0.5, 0.0, 0.25, 0.25]).log())
+        tensor([0, 0, 2, 3])
+    """
+    num = log_weights.shape[-1] if num_samples is None else num_samples
     with torch.no_grad():
         dtype, device = log_weights.dtype, log_weights.device
         cumulative = log_weights.softmax(-1).cumsum(-1)

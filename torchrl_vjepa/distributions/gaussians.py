@@ -124,6 +124,7 @@ class DiagGaussian(Independent):
         self._given = spread
         self._is_log_var, self._log_var_range = is_log_var, log_var_range
         self._bounded: Tensor | None = None
+        self._grad_enabled = torch.is_grad_enabled()
         self.reinterpreted_batch_ndims = 1
         Distribution.__init__(self, batch, loc.shape[-1:], validate_args=False)
 
@@ -132,14 +133,14 @@ class DiagGaussian(Independent):
         """Scale or bounded log-variance: a loss that needs the mean alone does not pay for it."""
         if self._log_var_range is None:
             return self._given
-        if self._bounded is not None and self._bounded.requires_grad == self._needs_grad():
+        if self._bounded is not None:
             return self._bounded
-        self._bounded = soft_clamp(self._given, *self._log_var_range)
-        return self._bounded
-
-    def _needs_grad(self) -> bool:
-        # What was computed without gradients must not be handed out where they are wanted.
-        return self._given.requires_grad and torch.is_grad_enabled()
+        # As if it had been computed at once: a reading under no_grad takes no gradients away.
+        with torch.set_grad_enabled(self._grad_enabled):
+            bounded = soft_clamp(self._given, *self._log_var_range)
+        if not torch.is_inference_mode_enabled():
+            self._bounded = bounded
+        return bounded
 
     @property
     def base_dist(self) -> Normal:

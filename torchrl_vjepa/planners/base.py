@@ -353,6 +353,12 @@ class Planner(MPCPlannerBase):
             std = torch.where(found, std, proposal.std).clamp(floor, self.cold_std)
             proposal = Proposal(mean, std)
         actions = proposal.mean if self.output == "mean" else best
+        if self._constrained and self.output == "mean":
+            # The mean of feasible plans may be none (around an obstacle it lies in it).
+            self._model_generator.set_state(model_state)
+            cost = self._evaluate(state, actions.unsqueeze(-3))[..., 0]
+            worse = (cost >= REJECTED_COST) & (best_cost < cost)
+            actions = torch.where(worse[..., None, None], best, actions)
         return Plan(actions, proposal.std, best, best_cost)
 
     @property

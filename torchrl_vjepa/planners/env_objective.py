@@ -50,6 +50,15 @@ class EnvObjective:
                 "env must accept any batch size to be planned over (batch_locked=False), "
                 f"got {type(env).__name__}"
             )
+        base = getattr(env, "base_env", env)
+        own = getattr(base, "sampling", None)
+        if own is not None:
+            settings = own()
+            if settings.constraints or (settings.num_samples or 1) > 1:
+                raise ValueError(
+                    f"env must not wrap a {type(base).__name__} with num_samples, risk or constraints, which "
+                    "stepping would ignore: plan over the LatentEnv itself, or leave them out"
+                )
         if reward_key is None:
             if len(env.reward_keys) != 1:
                 raise ValueError(
