@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import matplotlib as mpl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -71,10 +72,10 @@ def peak(call: Call) -> int:
 class Problem:
     """An MLP predictor, a linear observation model, and inputs of given sizes."""
 
-    def __init__(self, **sizes: int) -> None:
+    def __init__(self, seed: int, **sizes: int) -> None:
         self.sizes = {**SIZES, **sizes}
         batch, latent, horizon = (self.sizes[name] for name in ("batch", "latent", "horizon"))
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         self.predictor = Predictor(latent, action_dim=ACTION, trunk="mlp", num_cells=(WIDTH,))
         self.first, self.last = self.predictor.trunks[0][0], self.predictor.trunks[0][-1]
         self.sensor = torch.randn(latent, OBSERVATION)
@@ -214,10 +215,10 @@ CASES = ("rollout_mean", "rollout_sample", "moments_linearize", "moments_sigma_p
 
 
 @torch.no_grad()
-def compare(case: str, rounds: int, calls: int) -> dict[str, Any]:
+def compare(case: str, rounds: int, calls: int, seed: int) -> dict[str, Any]:
     """Interleaved rounds; medians of times and of their ratios; peaks of memory."""
     batch = BATCH.get(case, SIZES["batch"])
-    library, bare = getattr(Problem(batch=batch), case)()
+    library, bare = getattr(Problem(seed, batch=batch), case)()
     results = []
     for call in (library, bare):
         torch.manual_seed(1)
@@ -254,9 +255,9 @@ GROWTH = {
 
 
 @torch.no_grad()
-def grow(case: str, name: str, low: int, high: int, rounds: int) -> dict[str, Any]:
+def grow(case: str, name: str, low: int, high: int, rounds: int, seed: int) -> dict[str, Any]:
     """Exponents of time and memory between two sizes."""
-    calls = [getattr(Problem(**{name: size}), case)()[0] for size in (low, high)]
+    calls = [getattr(Problem(seed, **{name: size}), case)()[0] for size in (low, high)]
     times: tuple[list[float], list[float]] = ([], [])
     for round_ in range(rounds + 1):
         for call, seconds in zip(calls, times, strict=True):
@@ -276,10 +277,10 @@ def grow(case: str, name: str, low: int, high: int, rounds: int) -> dict[str, An
 
 
 @torch.no_grad()
-def chunk(chunk_size: int | None) -> dict[str, Any]:
+def chunk(chunk_size: int | None, seed: int) -> dict[str, Any]:
     """Peak memory beyond the result itself, of many samples and many particles."""
     num = 4096
-    problem = Problem(batch=4, particles=num)
+    problem = Problem(seed, batch=4, particles=num)
     run = problem.make_filter(chunk_size=chunk_size)
     belief = ParticleBelief(problem.particles, problem.log_weights, validate_args=False)
 
@@ -301,15 +302,44 @@ def chunk(chunk_size: int | None) -> dict[str, Any]:
     }
 
 
+def draw(rows: list[dict[str, Any]], chunks: list[dict[str, Any]], folder: Path) -> None:
+    """Ratios of time and memory, and what chunks save."""
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+    places = torch.arange(len(rows)).double()
+    for shift, key, color in ((-0.2, "time_ratio", "#0072B2"), (0.2, "memory_ratio", "#E69F00")):
+        left.bar(places + shift, [row[key] for row in rows], 0.4, color=color, label=key.split("_")[0])
+    left.axhline(1.2, color="black", ls="--", lw=1, label="1.2")
+    left.set_xticks(places, [row["case"].replace("_", "\n") for row in rows], fontsize=8)
+    left.set_ylabel("library / bare tensor arithmetic")
+    left.set_ylim(0, 1.7)
+    left.legend(frameon=False, ncols=3)
+    names = [str(row["chunk_size"] or "all") for row in chunks]
+    for key, style in (("rollout_bytes", "o-"), ("filter_bytes", "s--")):
+        right.plot(names, [row[key] / 1e6 for row in chunks], style, label=key.split("_")[0])
+    right.set(xlabel="chunk_size (samples or particles)", ylabel="peak memory (MB)", yscale="log")
+    right.legend(frameon=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    fig.savefig(folder / "belief.png", dpi=150)
+    plt.close(fig)
+
+
 def main() -> None:
     """Measure, print the tables, write the JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=15, help="interleaved rounds (default: 15)")
     parser.add_argument("--calls", type=int, default=5, help="calls in a round (default: 5)")
+    parser.add_argument("--seed", type=int, default=0, help="of weights and inputs (default: 0)")
+    parser.add_argument("--quick", action="store_true", help="one call of each: a test, not a result")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as JSON")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="draw belief.png there")
     args = parser.parse_args()
+    if args.quick:
+        args.rounds = args.calls = 1
     torch.set_num_threads(1)
-    rows = [compare(case, args.rounds, args.calls) for case in CASES]
+    rows = [compare(case, args.rounds, args.calls, args.seed) for case in CASES]
     print(f"{'':22s}{'library':>10s}{'bare':>10s}{'ratio':>8s}{'library':>11s}{'bare':>10s}{'ratio':>8s}")
     for row in rows:
         print(
@@ -317,7 +347,7 @@ def main() -> None:
             f"{row['library_bytes'] / 1e6:8.2f} MB{row['bare_bytes'] / 1e6:7.2f} MB{row['memory_ratio']:8.2f}"
         )
     growth = [
-        grow(case, name, *bounds, rounds=args.rounds)
+        grow(case, name, *bounds, rounds=args.rounds, seed=args.seed)
         for case, sizes in GROWTH.items()
         for name, bounds in sizes.items()
     ]
@@ -327,15 +357,18 @@ def main() -> None:
             f"{row['case']:22s}{row['size']:12s}{row['low']:6d}{row['high']:6d}"
             f"{row['time_exponent']:8.2f}{row['memory_exponent']:8.2f}"
         )
-    chunks = [chunk(size) for size in (None, 1024, 256, 64)]
+    chunks = [chunk(size, args.seed) for size in (None, 1024, 256, 64)]
     print(f"\n{'chunk_size':>10s}{'rollout':>12s}{'its result':>12s}{'filter step':>13s}   (peak MB)")
     for row in chunks:
         print(
             f"{row['chunk_size'] or 'all':>10}{row['rollout_bytes'] / 1e6:12.2f}"
             f"{row['rollout_result_bytes'] / 1e6:12.2f}{row['filter_bytes'] / 1e6:13.2f}"
         )
+    if args.out:
+        draw(rows, chunks, args.out)
     if args.json:
-        settings = {"rounds": args.rounds, "calls": args.calls}
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        settings = {"rounds": args.rounds, "calls": args.calls, "seed": args.seed}
         result = {"settings": settings, "sizes": SIZES, "rows": rows, "growth": growth, "chunks": chunks}
         args.json.write_text(json.dumps(result, indent=1))
 

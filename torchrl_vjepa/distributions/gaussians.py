@@ -138,7 +138,8 @@ class DiagGaussian(Independent):
         # As if it had been computed at once: a reading under no_grad takes no gradients away.
         with torch.set_grad_enabled(self._grad_enabled):
             bounded = soft_clamp(self._given, *self._log_var_range)
-        if not torch.is_inference_mode_enabled():
+        # What inference mode makes can never have gradients.
+        if torch.compiler.is_compiling() or not torch.is_inference_mode_enabled():
             self._bounded = bounded
         return bounded
 
