@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import torch
 from torch import Tensor
 
@@ -172,6 +173,24 @@ def truth() -> float:
     return -(2 * (0.5 * math.log(2 * math.pi * math.e) + math.log(0.2)) + math.log(2))
 
 
+def draw(rows: list[dict[str, Any]], folder: Path) -> None:
+    """Likelihood and mass in the wall of every head, a point for each seed."""
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    fig, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
+    for ax, key in zip(axes, ("test_log_prob", "wall_mass"), strict=True):
+        ax.plot([row[key] for row in rows], [row["head"] for row in rows], "o", color="#0072B2", alpha=0.7)
+        ax.grid(axis="x", lw=0.3)
+    axes[0].axvline(truth(), color="black", ls="--", lw=1, label="true density")
+    axes[0].set_xlabel("held-out log-likelihood (nats)")
+    axes[0].legend(frameon=False)
+    axes[1].set_xlabel("predicted mass in the wall (share)")
+    folder.mkdir(parents=True, exist_ok=True)
+    fig.savefig(folder / "heads.png", dpi=150)
+    plt.close(fig)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print the tables, write the JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -181,6 +200,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.add_argument(flag, type=int, default=item.default, help=text)
     parser.add_argument("--quick", action="store_true", help="a small version that only shows that it runs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as JSON")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="draw heads.png there")
     args = parser.parse_args(arguments)
     settings = Settings(**{item.name: getattr(args, item.name) for item in fields(Settings)})
     if args.quick:
@@ -204,7 +224,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 statistics.fmean(row[key] for row in mine) for key in ("test_log_prob", "wall_mass")
             )
             print(f"{name:22s}{score:22.3f}{wall:18.3f}")
+    if args.out:
+        draw(quality, args.out)
     if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(
             json.dumps(
                 {"settings": asdict(settings), "truth": truth(), "cost": cost, "rows": quality}, indent=1
