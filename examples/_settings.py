@@ -52,6 +52,8 @@ def read_settings(
 ) -> tuple[S, argparse.Namespace]:
     """The settings, and all arguments; what is given wins over --quick."""
     args = parser.parse_args(arguments)
+    if args.quick:
+        print("--quick: tiny sizes, to see that it runs; the numbers are no results")
     given = {entry.name: getattr(args, entry.name) for entry in fields(settings)}
     given = {name: value for name, value in given.items() if value is not None}
     return replace(settings(), **{**(quick if args.quick else {}), **given}), args

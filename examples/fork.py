@@ -432,6 +432,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parse(arguments)
     given = {option.name: getattr(args, option.name) for option in fields(Settings)}
     given = {name: value for name, value in given.items() if value is not None}
+    if args.quick:
+        print("--quick: tiny sizes, to see that it runs; the numbers are no results")
     settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
     for path in (args.out, args.json.parent if args.json else args.out):
         path.mkdir(parents=True, exist_ok=True)
