@@ -10,11 +10,10 @@ vehicle gets past it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -30,6 +29,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
+from _settings import command_line, option, read_settings
 from torchrl_vjepa import (
     VJEPA,
     BatchedForkEnv,
@@ -68,19 +68,12 @@ NUM_DRAWN = 40
 Row = dict[str, Any]
 
 
-def option(default: Any, help: str) -> Any:
-    """A setting with the sentence that --help says about it."""
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata={"help": help})
-    return field(default=default, metadata={"help": help})
-
-
 @dataclass
 class Settings:
     """What the run does; every field is a command-line option."""
 
     seeds: list[int] = option([0], "each seed makes the data, the training and the planner's noise")
-    heads: list[str] = option(list(HEADS), "heads to compare")
+    heads: list[str] = option(list(HEADS), "heads to compare", choices=list(HEADS))
     train_episodes: int = option(4_000, "episodes of random steering to learn from")
     test_episodes: int = option(1_000, "held-out episodes of random steering")
     train_steps: int = option(1_000, "optimiser steps")
@@ -402,39 +395,9 @@ def figure(drawn: dict[str, Shown], path: Path) -> None:
     plt.close(fig)
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
-    """Command line: the settings, and where the results go."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    defaults = Settings()
-    for option in fields(Settings):
-        default = getattr(defaults, option.name)
-        many = isinstance(default, list)
-        shown = " ".join(map(str, default)) if many else default
-        parser.add_argument(
-            "--" + option.name.replace("_", "-"),
-            type=type(default[0] if many else default),
-            nargs="+" if many else None,
-            choices=list(HEADS) if option.name == "heads" else None,
-            help=f"{option.metadata['help']} (default: {shown})",
-        )
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: a test, not a result")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write settings and rows as JSON")
-    parser.add_argument(
-        "--out", type=Path, default=Path("outputs"), metavar="FOLDER", help="where the figure goes"
-    )
-    return parser.parse_args(arguments)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
-    args = parse(arguments)
-    given = {option.name: getattr(args, option.name) for option in fields(Settings)}
-    given = {name: value for name, value in given.items() if value is not None}
-    if args.quick:
-        print("--quick: tiny sizes, to see that it runs; the numbers are no results")
-    settings = replace(Settings(), **{**(QUICK if args.quick else {}), **given})
+    settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
     for path in (args.out, args.json.parent if args.json else args.out):
         path.mkdir(parents=True, exist_ok=True)
     logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes

@@ -240,7 +240,8 @@ def train_restarts(
     loss.eval()
     with torch.no_grad():
         scores = torch.stack([score(loss(windows())) for _ in range(20)]).mean(0)
-    best = scores.reshape(len(systems), settings.restarts).argmax(1)
+    # argmax takes the NaN of a start that diverged for the largest number.
+    best = scores.nan_to_num(-torch.inf).reshape(len(systems), settings.restarts).argmax(1)
     return [loss.get_model(i * settings.restarts + int(restart)) for i, restart in enumerate(best)]
 
 

@@ -18,7 +18,7 @@ from torchrl_vjepa.baselines import PixelAR, PixelARLoss, PixelDecoder
 from torchrl_vjepa.distributions import Delta
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 
-O, D, A = 7, 3, 2  # noqa: E741
+O, D, A = 7, 3, 2  # noqa: E741 (sizes, as in the docstrings)
 B, T = 6, 5
 
 

@@ -259,7 +259,7 @@ class TestSample:
         class Broken(Distribution):
             arg_constraints: dict[str, object] = {}
 
-            def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+            def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008 (the signature of torch)
                 torch.rand(3)
                 raise RuntimeError("broken")
 

@@ -23,7 +23,7 @@ from torchrl_vjepa.models import JEPA, VJEPA, LatentModel
 from torchrl_vjepa.noisy_tv import BatchedNoisyTVEnv, LinearGaussianSystem
 from torchrl_vjepa.predictor import Predictor
 
-O, D, A, B = 7, 3, 2, 5  # noqa: E741
+O, D, A, B = 7, 3, 2, 5  # noqa: E741 (sizes, as in the docstrings)
 
 
 class Reward(nn.Module):

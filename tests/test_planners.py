@@ -726,7 +726,7 @@ class _Exponential:
 
 
 class GeneratorSpy(LatentEnv):
-    seen: list[Tensor] = []  # noqa: RUF012
+    seen: list[Tensor] = []
 
     def __init__(self) -> None:
         super().__init__(
@@ -1091,7 +1091,7 @@ class OwnObjective(WrapperEnv):
 
 
 class TestChanceConstraints:
-    SETTINGS = {"planning_horizon": 1, "optim_steps": 8, "num_candidates": 128, "seed": 0}  # noqa: RUF012
+    SETTINGS = {"planning_horizon": 1, "optim_steps": 8, "num_candidates": 128, "seed": 0}
 
     @pytest.mark.parametrize("cls", PLANNERS)
     @pytest.mark.parametrize("delta", [0.0, 0.01, 0.03])

@@ -256,7 +256,7 @@ def test_entries_fit_the_trainer(name: str) -> None:
     """loss_* entries carry the gradient, nothing else does; finite scalars, one per model."""
     terms = make_loss(name)(make_windows())
     shape = (2,) if "list" in name else ()
-    assert any(key.startswith("loss_") for key in terms.keys())  # noqa: SIM118
+    assert any(key.startswith("loss_") for key in terms.keys())  # noqa: SIM118 (a TensorDict iterates over rows, not keys)
     for key, value in terms.items():
         assert value.shape == shape
         assert value.dtype == torch.float32
@@ -273,7 +273,7 @@ def test_reductions(name: str) -> None:
         loss = make_loss(name, reduction=reduction)
         results[reduction] = seeded(loss, windows)
         assert list(results[reduction].keys()) == loss.out_keys
-    assert all(key.startswith("loss_") for key in results["none"].keys())  # noqa: SIM118
+    assert all(key.startswith("loss_") for key in results["none"].keys())  # noqa: SIM118 (a TensorDict iterates over rows, not keys)
     lead = (2,) if "list" in name else ()
     per_pair = {"loss_nll", "loss_head", "loss_prediction", "loss_reconstruction", "loss_structural_kl"}
     for key, value in results["none"].items():
