@@ -281,6 +281,8 @@ class LatentPredictionLoss(WindowLoss):
         # KL(N(m, S) || N(0, I)) = (tr S + |m|^2 - D - log det S) / 2; the entropy is the log det's half.
         trace = (variance + mean.square()).sum(-1)
         gaussian_constant = 0.5 * dim * math.log(2 * math.pi)
+        if not self._is_active("marginal_entropy_coeff"):
+            values = values.detach()  # an eigenvalue problem that nothing moves needs no gradient
         divergence = 0.5 * trace + gaussian_constant - spectrum_entropy(values)
         return {
             "loss_variance": self.variance_coeff * (1 - (variance + 1e-4).sqrt()).relu().mean(-1),
