@@ -22,8 +22,8 @@ class PseudoLikelihood(nn.Module):
     prior in place of :math:`p(Z)` (section "Option B: Latent-Space Update").
 
     Args:
-        target: :math:`q_{\theta'}`: ``observation (*B, 1, O) -> Distribution``, batch ``(*B, 1)`` and event
-        XX
+        target: :math:`q_{\theta'}`: ``observation (*B, 1, O) -> Distribution``, batch ``(*B, 1)`` and
+            event ``(D,)``.
         reference_prior: :math:`p_{\text{ref}}`: anything with ``log_prob(latent)``; by default
             :math:`\mathcal N(0, I)`, as in the KL term of ``eq:vjepa_objective``.
 
