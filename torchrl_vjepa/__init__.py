@@ -36,7 +36,9 @@ from torchrl_vjepa.diagnostics import (
 from torchrl_vjepa.distributions import (
     CouplingFlow,
     Delta,
+    Density,
     Ensemble,
+    GaussianFactor,
     LowRankGaussian,
     Mixture,
     diag_gaussian,
@@ -87,7 +89,7 @@ from torchrl_vjepa.objectives import (
 )
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
-from torchrl_vjepa.priors import GaussianPrior
+from torchrl_vjepa.priors import BoundPrior, GaussianPrior, Prior
 from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.temperature import temper
@@ -99,6 +101,7 @@ __all__ = [
     "BJEPALoss",
     "BatchedForkEnv",
     "BatchedNoisyTVEnv",
+    "BoundPrior",
     "CEM",
     "Calibration",
     "ChanceConstraint",
@@ -108,6 +111,7 @@ __all__ = [
     "CredibleInterval",
     "Delta",
     "DeltaHead",
+    "Density",
     "DiagGaussianHead",
     "Ensemble",
     "EnsembleHead",
@@ -117,6 +121,7 @@ __all__ = [
     "ForkSystem",
     "FullGaussianHead",
     "FusedPredictor",
+    "GaussianFactor",
     "GaussianPrior",
     "Head",
     "JEPA",
@@ -143,6 +148,7 @@ __all__ = [
     "PixelDecoder",
     "Planner",
     "Predictor",
+    "Prior",
     "Proposal",
     "PseudoLikelihood",
     "QuadraticReward",

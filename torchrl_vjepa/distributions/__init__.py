@@ -6,6 +6,7 @@ moments, divergences), and the classes are the predictive distributions that tor
 """
 
 from torchrl_vjepa.distributions.delta import Delta
+from torchrl_vjepa.distributions.densities import Density, GaussianFactor
 from torchrl_vjepa.distributions.divergences import (
     Estimate,
     entropy_bounds,
@@ -32,8 +33,10 @@ __all__ = [
     "Coupling",
     "CouplingFlow",
     "Delta",
+    "Density",
     "Ensemble",
     "Estimate",
+    "GaussianFactor",
     "LowRankGaussian",
     "Mixture",
     "NoiseDistribution",

@@ -1,4 +1,4 @@
-"""Priors: from a task to a density over latents."""
+"""Gaussian priors, fixed or learned."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, MultivariateNormal
 
 from torchrl_vjepa.distributions import diag_gaussian
+from torchrl_vjepa.priors.base import Prior, Task
 
 __all__ = ["GaussianPrior"]
 
 
-class GaussianPrior(nn.Module):
+class GaussianPrior(Prior):
     r"""Gaussian over latents, :math:`p(Z) = \mathcal N(\mu, \Sigma)`; fixed or learned.
 
     The learned diagonal one, starting at :math:`\mathcal N(0, I)`, is the static structural prior of the
@@ -49,12 +50,11 @@ class GaussianPrior(nn.Module):
         covariance: Tensor | None = None,
         learnable: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(latent_dim=latent_dim)
         if latent_dim < 1:
             raise ValueError(f"latent_dim must be positive, got {latent_dim}")
         if std is not None and covariance is not None:
             raise ValueError("at most one of std and covariance must be given, got both")
-        self.latent_dim = latent_dim
         entries = {"mean": _vector("mean", mean, latent_dim)}
         if covariance is None:
             scale = _vector("std", 1.0 if std is None else std, latent_dim)
@@ -90,7 +90,7 @@ class GaussianPrior(nn.Module):
             for name, value in self._initial.items():
                 getattr(self, name).copy_(value)
 
-    def forward(self, task: Tensor | None = None) -> Distribution:
+    def forward(self, task: Task = None) -> Distribution:
         """The Gaussian; it does not depend on the task.
 
         Args:
@@ -107,17 +107,6 @@ class GaussianPrior(nn.Module):
             return diag_gaussian(mean, log_var=log_var)
         factor = self.lower.tril(-1) + torch.diag_embed(self.log_diagonal.exp())
         return MultivariateNormal(self.mean, scale_tril=factor, validate_args=False)
-
-    def log_prob(self, latent: Tensor) -> Tensor:
-        r"""Log-density :math:`\log p(Z)`.
-
-        Args:
-            latent: of shape ``(*B, D)``.
-
-        Returns:
-            ``(*B)``, in nats.
-        """
-        return self().log_prob(latent)
 
 
 def _vector(name: str, value: Tensor | float, size: int) -> Tensor:
