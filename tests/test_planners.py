@@ -41,6 +41,7 @@ from torchrl_vjepa.planners import (
     Planner,
     Proposal,
     RandomShooting,
+    SamplingPlanner,
 )
 from torchrl_vjepa.risk import (
     REJECTED_COST,
@@ -203,7 +204,7 @@ def cold(planner: Planner, num: int) -> Proposal:
     return Proposal(planner.centre.expand(shape), planner.cold_std.expand(shape))
 
 
-class Runaway(Planner):
+class Runaway(SamplingPlanner):
     next_std: float
 
     def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:

@@ -1,4 +1,4 @@
-"""Planners that act through a model: one loop, and one method per planner."""
+"""Planners that act through a model: one parent, and one method per planner."""
 
 from torchrl_vjepa.planners.base import Plan, Planner
 from torchrl_vjepa.planners.cem import CEM
@@ -6,5 +6,6 @@ from torchrl_vjepa.planners.env_objective import EnvObjective
 from torchrl_vjepa.planners.mppi import MPPI
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.random_shooting import RandomShooting
+from torchrl_vjepa.planners.sampling import SamplingPlanner
 
-__all__ = ["CEM", "MPPI", "EnvObjective", "Plan", "Planner", "Proposal", "RandomShooting"]
+__all__ = ["CEM", "MPPI", "EnvObjective", "Plan", "Planner", "Proposal", "RandomShooting", "SamplingPlanner"]

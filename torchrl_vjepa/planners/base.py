@@ -1,4 +1,4 @@
-"""What every sampling planner shares: the loop, the proposal, warm start, and TorchRL's edges."""
+"""What every planner shares: TorchRL's edges, the proposal, warm start and risk."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import abc
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -50,23 +50,16 @@ class Plan(NamedTuple):
 
 
 class Planner(MPCPlannerBase):
-    r"""Sampling-based model predictive control: propose plans, imagine them, refine the proposal.
+    r"""Model predictive control in an imagined environment: what all planners share.
 
-    Each of ``optim_steps`` rounds draws ``num_candidates`` action sequences of length
-    ``planning_horizon`` from a Gaussian clamped to the action bounds, evaluates them in one call of
-    the environment's objective, and hands the ``top_k`` best to :meth:`update`, the one method in
-    which planners differ. The proposal's mean and the best plan so far are candidates of every
-    round (if there are at least three), so the best plan never gets worse. The spread never
-    exceeds that of a cold start.
-
-    **Costs that are not finite rank last** (``nan`` and both infinities: a cost of minus infinity
-    is a fault, not a good plan). Where no cost is finite the proposal keeps its mean, so the action
-    is finite and inside the bounds, and one warning is given.
+    A planner searches action sequences of length ``planning_horizon`` for the one of least cost under
+    the environment's objective, and executes its first step. How it searches is :meth:`plan`, the one
+    method that a subclass gives: :class:`~torchrl_vjepa.planners.sampling.SamplingPlanner` draws
+    candidates, :class:`~torchrl_vjepa.planners.gradient.GradientMPC` follows the gradient. The actions
+    they return are finite and inside the bounds. Where no cost is finite, one warning is given.
 
     **Risk.** ``num_samples`` trajectories per plan, their ``risk`` and chance ``constraints`` replace
-    those of the environment, for this planner. The model's noise is common to all candidates and
-    rounds. Plans that a constraint rejects have no part in the refinement as long as a feasible one is
-    known; where there is none, the search heads for the least violation and a warning is given.
+    those of the environment, for this planner.
 
     **Memory between steps is in the tensordict.** With ``warm_start`` the planner reads
     ``plan_key`` and ``init_key`` and writes ``("next", plan_key)``, the plan shifted by one step
@@ -85,23 +78,17 @@ class Planner(MPCPlannerBase):
         env: a :class:`~torchrl_vjepa.envs.LatentEnv`, or any TorchRL environment that is not
             batch-locked, which is then stepped (see :class:`EnvObjective`).
         planning_horizon: steps ``H`` that are imagined.
-        optim_steps: rounds.
-        num_candidates: plans ``N`` per round.
-        top_k: elites ``K`` that refine the proposal; ``num_candidates // 8`` by default.
+        optim_steps: rounds of the search.
         action_key: where the action is written; the environment's by default.
         warm_start: start from the plan of the step before.
         warm_std: the spread after a warm start, as a fraction of the one after a cold start.
         init_std: spread of the proposal after a cold start: a fraction of half the range where the
             action is bounded (0.5 by default), in units of the action where it is not (no default).
-        min_std: floor under the spread, as a fraction of the one after a cold start.
-        antithetic: draw noise in pairs of opposite sign.
-        output: the plan is the ``"mean"`` of the proposal, or the ``"best"`` candidate seen.
         num_samples: trajectories ``M`` imagined for each plan; the environment's way by default.
         risk: ``(costs (M, *B)) -> (*B)`` of their costs, for instance
             :func:`~torchrl_vjepa.risk.cvar`; the environment's by default.
         constraints: chance constraints on them (:class:`~torchrl_vjepa.risk.ChanceConstraint`); the
-            environment's by default. The mean of feasible plans need not be feasible:
-            ``output="best"`` returns a plan that was checked.
+            environment's by default.
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
             (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
             there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
@@ -118,7 +105,7 @@ class Planner(MPCPlannerBase):
             or constraints.
 
     Examples:
-        A planner of one's own is one method:
+        A search of one's own is one method:
 
         >>> import torch
         >>> from tensordict import TensorDict
@@ -126,9 +113,11 @@ class Planner(MPCPlannerBase):
         >>> from torchrl_vjepa.costs import quadratic_cost
         >>> from torchrl_vjepa.distributions import Delta
         >>> from torchrl_vjepa.envs import LatentEnv
-        >>> class LocalSearch(Planner):
-        ...     def update(self, proposal, elites, costs):
-        ...         return Proposal(elites[..., 0, :, :], 0.5 * proposal.std)
+        >>> class Grid(Planner):
+        ...     def plan(self, state, proposal):
+        ...         actions = torch.linspace(-1, 1, 9).reshape(9, 1, 1)
+        ...         cost, index = self.env.objective(state, actions).min(-1)
+        ...         return Plan(actions[index], proposal.std, actions[index], cost)
         >>> def move(latent, action):
         ...     return Delta(latent + action)
         >>> env = LatentEnv(
@@ -137,10 +126,9 @@ class Planner(MPCPlannerBase):
         ...     cost=quadratic_cost(torch.ones(1)),
         ...     latent_dim=1,
         ... )
-        >>> planner = LocalSearch(env, planning_horizon=1, optim_steps=8, seed=0)
-        >>> out = planner(TensorDict(latent=torch.tensor([0.5])))
-        >>> out["action"].round(decimals=2), out["next", "plan"].shape
-        (tensor([0.5000]), torch.Size([1, 1]))
+        >>> planner = Grid(env, planning_horizon=1)
+        >>> planner(TensorDict(latent=torch.tensor([0.5])))["action"]
+        tensor([0.5000])
     """
 
     low: Tensor
@@ -153,16 +141,11 @@ class Planner(MPCPlannerBase):
         env: EnvBase,
         planning_horizon: int,
         optim_steps: int = 4,
-        num_candidates: int = 512,
-        top_k: int | None = None,
         *,
         action_key: NestedKey | None = None,
         warm_start: bool = True,
         warm_std: float = 0.3,
         init_std: float | None = None,
-        min_std: float = 0.01,
-        antithetic: bool = True,
-        output: Literal["mean", "best"] = "mean",
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
@@ -172,25 +155,11 @@ class Planner(MPCPlannerBase):
         seed: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        for name, value in (
-            ("planning_horizon", planning_horizon),
-            ("optim_steps", optim_steps),
-            ("num_candidates", num_candidates),
-        ):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-        if top_k is None:
-            top_k = max(1, num_candidates // 8)
-        if not 1 <= top_k <= num_candidates:
-            raise ValueError(f"top_k must be in [1, num_candidates={num_candidates}], got {top_k}")
+        check_counts(planning_horizon=planning_horizon, optim_steps=optim_steps)
         if not 0 < warm_std <= 1:
             raise ValueError(f"warm_std must be in (0, 1], got {warm_std}")
-        if not 0 < min_std <= 1:
-            raise ValueError(f"min_std must be in (0, 1], got {min_std}")
         if init_std is not None and not 0 < init_std < math.inf:
             raise ValueError(f"init_std must be positive and finite, got {init_std}")
-        if output not in ("mean", "best"):
-            raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
         if seed is not None and generator is not None:
             raise ValueError("at most one of seed and generator must be given, got both")
         leaves = [unravel_key(key) for key in env.full_action_spec.keys(True, True)]
@@ -206,9 +175,7 @@ class Planner(MPCPlannerBase):
         self.num_samples, self.risk = num_samples, risk
         self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
-        self.num_candidates, self.top_k = num_candidates, top_k
-        self.warm_start, self.warm_std, self.min_std = warm_start, warm_std, min_std
-        self.antithetic, self.output, self.return_stats = antithetic, output, return_stats
+        self.warm_start, self.warm_std, self.return_stats = warm_start, warm_std, return_stats
         self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
         self.action_shape = tuple(spec.shape)
         for name, tensor in (("low", low), ("high", high), ("centre", centre), ("cold_std", std)):
@@ -228,21 +195,6 @@ class Planner(MPCPlannerBase):
             generator.manual_seed(torch.initial_seed() if seed is None else seed)
         self._generator = generator
         self._model_generator = _offspring(generator, generator.device)
-
-    @abc.abstractmethod
-    def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
-        """Refine the proposal: the one method in which planners differ.
-
-        Args:
-            proposal: what the candidates were drawn from.
-            elites: the best candidates of this round, best first, of shape ``(*B, K, H, A)``.
-            costs: their costs, of shape ``(*B, K)``; infinite for those that were not finite, never
-                ``nan``. What is returned for rows without any finite cost is not used.
-
-        Returns:
-            The next proposal; the base class puts its mean inside the bounds and its spread
-            between the floor and the spread of a cold start.
-        """
 
     @property
     def generator(self) -> torch.Generator:
@@ -318,6 +270,7 @@ class Planner(MPCPlannerBase):
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
         return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
 
+    @abc.abstractmethod
     def plan(self, state: Any, proposal: Proposal) -> Plan:
         """Plan from a state: the whole algorithm, on tensors.
 
@@ -326,40 +279,8 @@ class Planner(MPCPlannerBase):
             proposal: where the search starts, with batch ``*B``.
 
         Returns:
-            The plan. No value leaves the device.
+            The plan, inside the bounds and without gradient.
         """
-        low, high = self.low, self.high
-        floor = self.min_std * self.cold_std
-        best = proposal.mean
-        best_cost = best.new_full(best.shape[:-2], math.inf)
-        model_state = self._model_generator.get_state()
-        for _ in range(self.optim_steps):
-            # The model's noise is the same in every round: costs of different rounds compare.
-            self._model_generator.set_state(model_state)
-            candidates = self._candidates(proposal, best)
-            costs = self._evaluate(state, candidates)
-            elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
-            if self._constrained:
-                feasible = elite_costs < REJECTED_COST
-                elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
-            index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
-            elites = candidates.gather(-3, index)
-            found = elite_costs[..., 0].isfinite()[..., None, None]
-            better = elite_costs[..., 0] < best_cost
-            best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
-            best_cost = torch.where(better, elite_costs[..., 0], best_cost)
-            mean, std = self.update(proposal, elites, elite_costs)
-            mean = torch.where(found, mean, proposal.mean).clamp(low, high)
-            std = torch.where(found, std, proposal.std).clamp(floor, self.cold_std)
-            proposal = Proposal(mean, std)
-        actions = proposal.mean if self.output == "mean" else best
-        if self._constrained and self.output == "mean":
-            # The mean of feasible plans may be none (around an obstacle it lies in it).
-            self._model_generator.set_state(model_state)
-            cost = self._evaluate(state, actions.unsqueeze(-3))[..., 0]
-            worse = (cost >= REJECTED_COST) & (best_cost < cost)
-            actions = torch.where(worse[..., None, None], best, actions)
-        return Plan(actions, proposal.std, best, best_cost)
 
     @property
     def _source(self) -> Any:
@@ -408,27 +329,6 @@ class Planner(MPCPlannerBase):
             torch.where(warm, self.warm_std * std, std),
         )
 
-    def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
-        """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
-        mean, std = proposal
-        num = self.num_candidates
-        drawn = (num + 1) // 2 if self.antithetic else num
-        noise = torch.randn(
-            (drawn, *mean.shape[-2:]),
-            generator=self._generator,
-            device=mean.device,
-            dtype=mean.dtype,
-        )
-        if self.antithetic:
-            noise = torch.cat([noise, -noise])[:num]
-        candidates = torch.addcmul(mean.unsqueeze(-3), std.unsqueeze(-3), noise)
-        candidates = candidates.clamp_(self.low, self.high)
-        if num > 1:
-            candidates[..., 0, :, :] = mean
-        if num > 2:
-            candidates[..., 1, :, :] = best
-        return candidates
-
     def _checked_sampling(self, asked: dict[str, Any]) -> bool:
         """Refuse early what the environment cannot evaluate; true if there are constraints."""
         source = self._source
@@ -476,6 +376,23 @@ class Planner(MPCPlannerBase):
         if self._generator.device != self.low.device:
             self._generator = _offspring(self._generator, self.low.device)
             self._model_generator = _offspring(self._generator, self.low.device)
+
+
+def check_counts(**counts: int) -> None:
+    """Refuse what does not count anything.
+
+    Args:
+        **counts: arguments by name.
+
+    Raises:
+        ValueError: if one is no integer of at least 1.
+
+    Examples:
+        >>> check_counts(optim_steps=4)
+    """
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
 
 
 def _offspring(generator: torch.Generator, device: torch.device) -> torch.Generator:

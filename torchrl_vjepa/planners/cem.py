@@ -5,19 +5,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchrl_vjepa.planners.base import Planner
 from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.sampling import SamplingPlanner
 
 __all__ = ["CEM"]
 
 
-class CEM(Planner):
+class CEM(SamplingPlanner):
     r"""Cross-entropy method.
 
     The next proposal has the mean of the elites, all counting the same, and their root mean square
     distance from the mean *before* (see :func:`weighted_gaussian`). Only the ranking of costs
     matters: any increasing function of the cost gives the same plan.
-    Takes the arguments of :class:`Planner`, positional ones in the order of TorchRL's
+    Takes the arguments of :class:`SamplingPlanner`, positional ones in the order of TorchRL's
     ``CEMPlanner``.
 
     Examples:

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Planner
 from torchrl_vjepa.planners.cem import weighted_gaussian
 from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.sampling import SamplingPlanner
 
 __all__ = ["MPPI"]
 
 
-class MPPI(Planner):
+class MPPI(SamplingPlanner):
     r"""Model predictive path integral control.
 
     The next proposal has the weighted mean of the elites and their weighted root mean square
@@ -31,17 +31,17 @@ class MPPI(Planner):
     its temperature. With ``normalize_costs`` scale and origin of the cost do not matter.
 
     Args:
-        env: see :class:`Planner`.
-        planning_horizon: see :class:`Planner`.
-        optim_steps: see :class:`Planner`.
-        num_candidates: see :class:`Planner`.
-        top_k: see :class:`Planner`; the classic algorithm has no elites: ``num_candidates``.
+        env: see :class:`SamplingPlanner`.
+        planning_horizon: see :class:`SamplingPlanner`.
+        optim_steps: see :class:`SamplingPlanner`.
+        num_candidates: see :class:`SamplingPlanner`.
+        top_k: see :class:`SamplingPlanner`; the classic algorithm has no elites: ``num_candidates``.
         temperature: :math:`\lambda`, positive.
         normalize_costs: divide costs by their standard deviation among the elites.
-        **kwargs: see :class:`Planner`.
+        **kwargs: see :class:`SamplingPlanner`.
 
     Raises:
-        ValueError: if ``temperature`` is not positive and finite; else see :class:`Planner`.
+        ValueError: if ``temperature`` is not positive and finite; else see :class:`SamplingPlanner`.
 
     Examples:
         >>> import torch

@@ -7,13 +7,13 @@ from typing import Any
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Planner
 from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.sampling import SamplingPlanner
 
 __all__ = ["RandomShooting"]
 
 
-class RandomShooting(Planner):
+class RandomShooting(SamplingPlanner):
     r"""Algorithm VJEPA-MPC of the paper: the first action of the cheapest sampled plan.
 
     :math:`i^\star = \arg\min_i \sum_{k=0}^{H-1} c(Z^{(i)}_{t+k+1}, u^{(i)}_{t+k})`, executing
@@ -22,12 +22,12 @@ class RandomShooting(Planner):
     ``num_candidates``.
 
     Args:
-        env: see :class:`Planner`.
-        planning_horizon: see :class:`Planner`.
+        env: see :class:`SamplingPlanner`.
+        planning_horizon: see :class:`SamplingPlanner`.
         optim_steps: portions of candidates.
         num_candidates: the paper's number of samples ``M``, per portion.
         top_k: without effect; there for the sake of swapping planners.
-        **kwargs: see :class:`Planner`; ``output`` is always ``"best"``.
+        **kwargs: see :class:`SamplingPlanner`; ``output`` is always ``"best"``.
 
     Examples:
         >>> import torch

@@ -1,0 +1,182 @@
+"""Planners that draw candidate plans, keep the best and refine the Gaussian they are drawn from."""
+
+from __future__ import annotations
+
+import abc
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.risk import REJECTED_COST
+
+__all__ = ["SamplingPlanner"]
+
+
+class SamplingPlanner(Planner):
+    r"""Sampling-based model predictive control: propose plans, imagine them, refine the proposal.
+
+    Each of ``optim_steps`` rounds draws ``num_candidates`` action sequences of length
+    ``planning_horizon`` from a Gaussian clamped to the action bounds, evaluates them in one call of
+    the environment's objective, and hands the ``top_k`` best to :meth:`update`, the one method in
+    which planners differ. The proposal's mean and the best plan so far are candidates of every
+    round (if there are at least three), so the best plan never gets worse. The spread never
+    exceeds that of a cold start.
+
+    **Costs that are not finite rank last** (``nan`` and both infinities: a cost of minus infinity
+    is a fault, not a good plan). Where no cost is finite the proposal keeps its mean, so the action
+    is finite and inside the bounds, and one warning is given.
+
+    **Risk.** The model's noise is common to all candidates and rounds. Plans that a chance constraint
+    rejects have no part in the refinement as long as a feasible one is known; where there is none, the
+    search heads for the least violation and a warning is given. The mean of feasible plans need not be
+    feasible: ``output="best"`` returns a plan that was checked.
+
+    Args:
+        env: see :class:`Planner`.
+        planning_horizon: see :class:`Planner`.
+        optim_steps: rounds.
+        num_candidates: plans ``N`` per round.
+        top_k: elites ``K`` that refine the proposal; ``num_candidates // 8`` by default.
+        min_std: floor under the spread, as a fraction of the one after a cold start.
+        antithetic: draw noise in pairs of opposite sign.
+        output: the plan is the ``"mean"`` of the proposal, or the ``"best"`` candidate seen.
+        **kwargs: see :class:`Planner`.
+
+    Raises:
+        ValueError: if an argument is out of its range; else see :class:`Planner`.
+
+    Examples:
+        A planner of one's own is one method:
+
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> from torchrl_vjepa.envs import LatentEnv
+        >>> class LocalSearch(SamplingPlanner):
+        ...     def update(self, proposal, elites, costs):
+        ...         return Proposal(elites[..., 0, :, :], 0.5 * proposal.std)
+        >>> def move(latent, action):
+        ...     return Delta(latent + action)
+        >>> env = LatentEnv(
+        ...     move,
+        ...     action_spec=Bounded(-1, 1, (1,)),
+        ...     cost=quadratic_cost(torch.ones(1)),
+        ...     latent_dim=1,
+        ... )
+        >>> planner = LocalSearch(env, planning_horizon=1, optim_steps=8, seed=0)
+        >>> out = planner(TensorDict(latent=torch.tensor([0.5])))
+        >>> out["action"].round(decimals=2), out["next", "plan"].shape
+        (tensor([0.5000]), torch.Size([1, 1]))
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        planning_horizon: int,
+        optim_steps: int = 4,
+        num_candidates: int = 512,
+        top_k: int | None = None,
+        *,
+        min_std: float = 0.01,
+        antithetic: bool = True,
+        output: Literal["mean", "best"] = "mean",
+        **kwargs: Any,
+    ) -> None:
+        check_counts(num_candidates=num_candidates)
+        if top_k is None:
+            top_k = max(1, num_candidates // 8)
+        if not 1 <= top_k <= num_candidates:
+            raise ValueError(f"top_k must be in [1, num_candidates={num_candidates}], got {top_k}")
+        if not 0 < min_std <= 1:
+            raise ValueError(f"min_std must be in (0, 1], got {min_std}")
+        if output not in ("mean", "best"):
+            raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
+        super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        self.num_candidates, self.top_k = num_candidates, top_k
+        self.min_std, self.antithetic, self.output = min_std, antithetic, output
+
+    @abc.abstractmethod
+    def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
+        """Refine the proposal: the one method in which planners differ.
+
+        Args:
+            proposal: what the candidates were drawn from.
+            elites: the best candidates of this round, best first, of shape ``(*B, K, H, A)``.
+            costs: their costs, of shape ``(*B, K)``; infinite for those that were not finite, never
+                ``nan``. What is returned for rows without any finite cost is not used.
+
+        Returns:
+            The next proposal; the base class puts its mean inside the bounds and its spread
+            between the floor and the spread of a cold start.
+        """
+
+    def plan(self, state: Any, proposal: Proposal) -> Plan:
+        """Plan from a state: the whole algorithm, on tensors.
+
+        Args:
+            state: what ``planning_state`` of the environment gives, with batch ``*B``.
+            proposal: where the search starts, with batch ``*B``.
+
+        Returns:
+            The plan. No value leaves the device.
+        """
+        low, high = self.low, self.high
+        floor = self.min_std * self.cold_std
+        best = proposal.mean
+        best_cost = best.new_full(best.shape[:-2], math.inf)
+        model_state = self._model_generator.get_state()
+        for _ in range(self.optim_steps):
+            # The model's noise is the same in every round: costs of different rounds compare.
+            self._model_generator.set_state(model_state)
+            candidates = self._candidates(proposal, best)
+            costs = self._evaluate(state, candidates)
+            elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
+            if self._constrained:
+                feasible = elite_costs < REJECTED_COST
+                elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
+            index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
+            elites = candidates.gather(-3, index)
+            found = elite_costs[..., 0].isfinite()[..., None, None]
+            better = elite_costs[..., 0] < best_cost
+            best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
+            best_cost = torch.where(better, elite_costs[..., 0], best_cost)
+            mean, std = self.update(proposal, elites, elite_costs)
+            mean = torch.where(found, mean, proposal.mean).clamp(low, high)
+            std = torch.where(found, std, proposal.std).clamp(floor, self.cold_std)
+            proposal = Proposal(mean, std)
+        actions = proposal.mean if self.output == "mean" else best
+        if self._constrained and self.output == "mean":
+            # The mean of feasible plans may be none (around an obstacle it lies in it).
+            self._model_generator.set_state(model_state)
+            cost = self._evaluate(state, actions.unsqueeze(-3))[..., 0]
+            worse = (cost >= REJECTED_COST) & (best_cost < cost)
+            actions = torch.where(worse[..., None, None], best, actions)
+        return Plan(actions, proposal.std, best, best_cost)
+
+    def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
+        """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
+        mean, std = proposal
+        num = self.num_candidates
+        drawn = (num + 1) // 2 if self.antithetic else num
+        noise = torch.randn(
+            (drawn, *mean.shape[-2:]),
+            generator=self._generator,
+            device=mean.device,
+            dtype=mean.dtype,
+        )
+        if self.antithetic:
+            noise = torch.cat([noise, -noise])[:num]
+        candidates = torch.addcmul(mean.unsqueeze(-3), std.unsqueeze(-3), noise)
+        candidates = candidates.clamp_(self.low, self.high)
+        if num > 1:
+            candidates[..., 0, :, :] = mean
+        if num > 2:
+            candidates[..., 1, :, :] = best
+        return candidates
