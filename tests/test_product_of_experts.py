@@ -273,7 +273,7 @@ def test_copies_and_pickles(prior: Any) -> None:
 
 def test_a_deterministic_predictor_cannot_be_fused() -> None:
     fused = FusedPredictor(Predictor(D, head=DeltaHead()), GaussianPrior(D))
-    with pytest.raises(TypeError, match="must be diagonal or multivariate Gaussians, got"):
+    with pytest.raises(TypeError, match="p must have a width for the prior to act on, got a point mass"):
         fused.dist(torch.zeros(1, D))
 
 

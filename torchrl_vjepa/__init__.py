@@ -45,6 +45,7 @@ from torchrl_vjepa.distributions import (
     entropy_bounds,
     full_gaussian,
     kl_divergence,
+    langevin,
     maximize_log_prob,
     moments,
     monte_carlo_entropy,
@@ -56,6 +57,14 @@ from torchrl_vjepa.distributions import (
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.fork import BatchedForkEnv, ForkEnv, ForkSystem
+from torchrl_vjepa.fusion import (
+    FusedBelief,
+    Fusion,
+    VirtualObservation,
+    fuse,
+    map_estimate,
+    sample_posterior,
+)
 from torchrl_vjepa.heads import (
     DeltaHead,
     DiagGaussianHead,
@@ -120,7 +129,9 @@ __all__ = [
     "ForkEnv",
     "ForkSystem",
     "FullGaussianHead",
+    "FusedBelief",
     "FusedPredictor",
+    "Fusion",
     "GaussianFactor",
     "GaussianPrior",
     "Head",
@@ -162,6 +173,7 @@ __all__ = [
     "VAELoss",
     "VJEPA",
     "VJEPALoss",
+    "VirtualObservation",
     "Whitening",
     "WindowLoss",
     "action_cost",
@@ -180,11 +192,14 @@ __all__ = [
     "entropy_bounds",
     "expectation",
     "full_gaussian",
+    "fuse",
     "gaussian_entropy",
     "history_encoder",
     "kl_divergence",
+    "langevin",
     "linear_encoder",
     "linear_probe",
+    "map_estimate",
     "maximize_log_prob",
     "mean_variance",
     "mlp_encoder",
@@ -202,6 +217,7 @@ __all__ = [
     "reliability_curve",
     "rollout",
     "sample",
+    "sample_posterior",
     "select_best",
     "sliced_gaussian_distance",
     "surprise",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
+import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
@@ -13,7 +15,7 @@ from torchrl.modules import WorldModelWrapper
 from torchrl_vjepa.distributions import diag_gaussian, point_estimate
 from torchrl_vjepa.heads import TargetScale
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
-from torchrl_vjepa.priors import GaussianPrior
+from torchrl_vjepa.priors import GaussianPrior, LatentDensity, Prior
 
 __all__ = ["BJEPA", "JEPA", "LatentModel", "VJEPA"]
 
@@ -286,13 +288,29 @@ class BJEPA(VJEPA):
         """The prior that shapes the dynamics in training."""
         return self.structural_prior_module.module
 
-    def fuse(self, prior: nn.Module | None = None) -> FusedPredictor:
+    def fuse(
+        self,
+        prior: Prior | LatentDensity | Callable[[], LatentDensity] | None = None,
+        *,
+        num_particles: int = 128,
+        generator: torch.Generator | None = None,
+        return_stats: bool = False,
+    ) -> FusedPredictor:
         """The dynamics, fused with a prior.
 
         Args:
             prior: the prior expert; the structural prior by default.
+            num_particles: see :class:`~torchrl_vjepa.predictor.FusedPredictor`, as the rest.
+            generator: source of randomness of importance weights.
+            return_stats: whether the module writes its statistics.
 
         Returns:
             A transition that shares its parameters with the model.
         """
-        return FusedPredictor(self.predictor, self.structural_prior if prior is None else prior)
+        return FusedPredictor(
+            self.predictor,
+            self.structural_prior if prior is None else prior,
+            num_particles=num_particles,
+            generator=generator,
+            return_stats=return_stats,
+        )

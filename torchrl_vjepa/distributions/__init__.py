@@ -21,6 +21,7 @@ from torchrl_vjepa.distributions.gaussians import (
     full_gaussian,
     soft_clamp,
 )
+from torchrl_vjepa.distributions.langevin import langevin
 from torchrl_vjepa.distributions.mixtures import Ensemble, Mixture, log_score
 from torchrl_vjepa.distributions.modes import maximize_log_prob
 from torchrl_vjepa.distributions.moments import moments
@@ -45,6 +46,7 @@ __all__ = [
     "from_noise",
     "full_gaussian",
     "kl_divergence",
+    "langevin",
     "log_score",
     "maximize_log_prob",
     "moments",

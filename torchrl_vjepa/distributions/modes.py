@@ -50,7 +50,7 @@ def maximize_log_prob(
 
     Raises:
         ValueError: if a callable comes without starts, a shape does not fit, ``num_steps`` is negative,
-            or no start of a row has a finite log-density.
+            the log-density has no gradient, or no start of a row has a finite log-density.
 
     Examples:
         >>> import torch
@@ -113,6 +113,11 @@ def _ascend(
                 f"{tuple(point.shape)}, got {tuple(value.shape)}"
             )
         _keep_best(record, value.detach(), point.detach())
+        if not value.requires_grad:
+            raise ValueError(
+                "target must be differentiable in the latents, got a log-density without gradient: is it "
+                "detached, rounded or a comparison?"
+            )
         objective = torch.where(value.isfinite(), value, 0.0).sum()
         (gradient,) = torch.autograd.grad(-objective, steps)
         # A row that went astray must not stop the others. LBFGS wants its gradients contiguous.

@@ -61,7 +61,7 @@ def product_of_experts(*experts: Distribution | GaussianFactor) -> Distribution:
         >>> product_of_experts(likelihood, prior).mean[0], product_of_experts(likelihood, prior).variance[0]
         (tensor([0.5000, 0.5000]), tensor([0.5000, 0.5000]))
         >>> first_is_two = GaussianFactor(torch.diag(torch.tensor([1.0, 0.0])), torch.tensor([2.0, 0.0]))
-        >>> product_of_experts(likelihood, first_is_two).mean[0]
+        >>> product_of_experts(likelihood, first_is_two).mean[0].round(decimals=3)
         tensor([1., 0.])
     """
     if not experts:

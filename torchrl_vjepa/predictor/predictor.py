@@ -2,84 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.modules import MLP
 
-from torchrl_vjepa.distributions import point_estimate, product_of_experts
 from torchrl_vjepa.heads import DiagGaussianHead, Head
+from torchrl_vjepa.predictor.model import PredictiveModel
 from torchrl_vjepa.stacking import is_plain_linear, linear
 from torchrl_vjepa.temperature import temper
-from torchrl_vjepa.windows import read
 
-__all__ = ["FusedPredictor", "Predictor"]
-
-
-class _Transition(TensorDictModuleBase):
-    """``dist`` as a TensorDictModule: what a predictor and its fusion with a prior share."""
-
-    latent_dim: int
-    action_dim: int
-    side_info_dim: int
-    skips: tuple[int, ...]
-    how: Literal["mean", "mode", "sample"]
-    latent_key: NestedKey
-    action_key: NestedKey
-    side_info_key: NestedKey
-
-    def dist(
-        self,
-        latent: Tensor,
-        action: Tensor | None = None,
-        *,
-        skip: int = 1,
-        side_info: Tensor | None = None,
-    ) -> Distribution:
-        raise NotImplementedError
-
-    def dist_of(self, tensordict: TensorDictBase) -> Distribution:
-        """The one-step predictive distribution of what ``in_keys`` names.
-
-        Args:
-            tensordict: holds ``latent`` and what else ``in_keys`` names.
-
-        Returns:
-            Distribution with batch ``*B`` and event ``(D,)``.
-
-        Raises:
-            KeyError: if an entry is missing.
-        """
-        latent, *rest = (read(tensordict, key, reader=type(self).__name__) for key in self.in_keys)
-        return self.dist(
-            latent,
-            rest.pop(0) if self.action_dim else None,
-            side_info=rest.pop(0) if self.side_info_dim else None,
-        )
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the one-step point prediction.
-
-        Args:
-            tensordict: holds ``latent`` and what else ``in_keys`` names.
-
-        Returns:
-            The same tensordict with the entry ``out_keys[0]``.
-
-        Raises:
-            KeyError: if an entry is missing.
-        """
-        p = self.dist_of(tensordict)
-        return tensordict.set(self.out_keys[0], point_estimate(p, self.how))
+__all__ = ["Predictor"]
 
 
-class Predictor(_Transition):
+class Predictor(PredictiveModel):
     r"""Predictive model :math:`p_\phi(Z_{t+\Delta} \mid Z_t, \xi_{t+\Delta}, u_{t:t+\Delta-1})`.
 
     The controlled latent transition of ``eq:vjepa_controlled_dynamics``. :math:`\Delta` is one of
@@ -332,58 +273,3 @@ class Predictor(_Transition):
                 f"got {None if side_info is None else tuple(side_info.shape)}"
             )
         return side_info
-
-
-class FusedPredictor(_Transition):
-    r"""Hard fusion of the dynamics with a prior by product of experts (``eq:bjepa_posterior``).
-
-    :math:`p(Z_T \mid Z_C, \eta) \propto p_{\text{like}}(Z_T \mid Z_C)\, p_{\text{prior}}(Z_T \mid \eta)`,
-    in closed form for Gaussians, also of mixtures of them. It is again a transition, with the attributes
-    of the predictor.
-
-    Args:
-        predictor: the likelihood expert :math:`p_{\text{like}}`, with a head that is Gaussian, a mixture
-            or an ensemble of Gaussians.
-        prior: the prior expert: a callable that returns a Gaussian over latents, for instance a
-            :class:`~torchrl_vjepa.priors.GaussianPrior`. ``None`` is the flat prior: the predictor's own
-            distribution.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_vjepa import GaussianPrior
-        >>> fused = FusedPredictor(Predictor(4), GaussianPrior(4))
-        >>> fused.dist(torch.zeros(7, 4)).mean.shape
-        torch.Size([7, 4])
-    """
-
-    def __init__(self, predictor: Predictor, prior: Callable[[], Distribution] | None = None) -> None:
-        super().__init__()
-        self.predictor = predictor
-        self.prior = prior
-        for name in ("latent_dim", "action_dim", "side_info_dim", "skips", "how"):
-            setattr(self, name, getattr(predictor, name))
-        for name in ("latent_key", "action_key", "side_info_key"):
-            setattr(self, name, getattr(predictor, name))
-        self.in_keys, self.out_keys = list(predictor.in_keys), list(predictor.out_keys)
-
-    def dist(
-        self,
-        latent: Tensor,
-        action: Tensor | None = None,
-        *,
-        skip: int = 1,
-        side_info: Tensor | None = None,
-    ) -> Distribution:
-        """The fused distribution of the latent ``skip`` steps ahead.
-
-        Args:
-            latent: of shape ``(*B, D)``.
-            action: as for :meth:`Predictor.dist`.
-            skip: as for :meth:`Predictor.dist`.
-            side_info: as for :meth:`Predictor.dist`.
-
-        Returns:
-            Gaussian with batch ``*B`` and event ``(D,)``.
-        """
-        p = self.predictor.dist(latent, action, skip=skip, side_info=side_info)
-        return p if self.prior is None else product_of_experts(p, self.prior())
