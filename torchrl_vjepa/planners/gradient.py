@@ -40,10 +40,10 @@ class GradientMPC(Planner):
     sees all rows and starts as one problem: its curvature and line search are common. A start whose cost
     is not finite has the cost infinity and no gradient; a gradient that is not finite counts as zero.
 
-    **Bounds.** ``"reparameterize"`` searches free numbers that are squashed smoothly onto the bounds
-    (:func:`~torchrl_vjepa.planners.squash.squash`); ``"project"`` puts the actions back onto the nearest
-    bound after each step. The variables that the optimiser sees are in units of the spread of a cold start,
-    so the default step suits any range.
+    **Bounds.** ``"project"`` puts the actions back onto the nearest bound after each step, and reaches
+    optima on a bound in fewer steps; ``"reparameterize"`` searches free numbers that are squashed smoothly
+    onto the bounds (:func:`~torchrl_vjepa.planners.squash.squash`). The variables that the optimiser sees
+    are in units of the spread of a cold start, so the default step suits any range.
 
     **Modes.** Works inside ``torch.no_grad`` and ``torch.inference_mode``. Nothing is accumulated on the
     model's parameters, and the model's training mode is left as it is.
@@ -105,7 +105,7 @@ class GradientMPC(Planner):
         *,
         optimizer: MakeOptimizer | None = None,
         num_starts: int = 4,
-        bounds: Literal["reparameterize", "project"] = "reparameterize",
+        bounds: Literal["reparameterize", "project"] = "project",
         tolerance: float | None = None,
         patience: int = 5,
         max_ms: float | None = None,
@@ -121,16 +121,18 @@ class GradientMPC(Planner):
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
         if self._constrained:
             raise ValueError(
-                "constraints must be empty for gradient planning: the frequency of violations has no gradient; "
-                "use a smooth barrier as a cost, a sampling planner (CEM, MPPI), or lift those of env by "
-                "constraints=[]"
+                "constraints must be empty for gradient planning: the frequency of violations has no "
+                "gradient; use a smooth barrier as a cost, a sampling planner (CEM, MPPI), or lift those of "
+                "env by constraints=[]"
             )
         self.optimizer = functools.partial(torch.optim.Adam, lr=0.2) if optimizer is None else optimizer
-        made = optimizer([torch.zeros(1, requires_grad=True)]) if callable(optimizer) else optimizer
-        if not (optimizer is None or (callable(optimizer) and isinstance(made, torch.optim.Optimizer))):
+        # Made once here, so that what is no factory is refused before planning.
+        made = self.optimizer([torch.zeros(1, requires_grad=True)]) if callable(self.optimizer) else None
+        if not isinstance(made, torch.optim.Optimizer):
+            got = f"{optimizer!r}" if made is None else f"one that makes {type(made).__name__}"
             raise TypeError(
-                "optimizer must be a function that makes a torch optimiser of a list of tensors, for instance "
-                f"functools.partial(torch.optim.SGD, lr=0.1), got {type(made).__name__}"
+                "optimizer must be a function that makes a torch optimiser of a list of tensors, for "
+                f"instance functools.partial(torch.optim.SGD, lr=0.1), got {got}"
             )
         self.num_starts, self.bounds = num_starts, bounds
         self.tolerance, self.patience, self.max_ms = tolerance, patience, max_ms
@@ -187,8 +189,8 @@ class GradientMPC(Planner):
                 (gradient,) = torch.autograd.grad(objective, x, allow_unused=True)
             if gradient is None:
                 raise ValueError(
-                    "the cost must be differentiable in the actions, got one to which no gradient flows through "
-                    f"{type(self.env).__name__}; use a sampling planner (CEM, MPPI) for it"
+                    "the cost must be differentiable in the actions, got one to which no gradient flows "
+                    f"through {type(self.env).__name__}; use a sampling planner (CEM, MPPI) for it"
                 )
             # LBFGS wants its gradients contiguous.
             x.grad = gradient.nan_to_num(0.0, 0.0, 0.0).contiguous()
