@@ -27,7 +27,7 @@ from torchrl_vjepa.costs import QuadraticReward
 from torchrl_vjepa.encoders import linear_encoder
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.models import VJEPA
-from torchrl_vjepa.planners import CEM, MPPI, Planner, RandomShooting
+from torchrl_vjepa.planners import CEM, MPPI, GradientMPC, Planner, RandomShooting
 from torchrl_vjepa.predictor import Predictor
 
 HORIZON = 3
@@ -50,7 +50,8 @@ def make_world() -> tuple[VJEPA, LatentEnv]:
 
 def make_policy(cls: type[Planner] = MPPI, **kwargs: Any) -> TensorDictSequential:
     model, world = make_world()
-    planner = cls(world, HORIZON, 2, 32, 8, seed=0, **kwargs)
+    sizes = (2,) if cls is GradientMPC else (2, 32, 8)
+    planner = cls(world, HORIZON, *sizes, seed=0, **kwargs)
     policy = TensorDictSequential(model.encoder, planner)
     return policy.select_out_keys("action", ("next", "plan"))
 
@@ -76,7 +77,7 @@ def check_memory(data: TensorDictBase) -> None:
     assert "latent" not in data.keys(True)
 
 
-@pytest.mark.parametrize("cls", [RandomShooting, CEM, MPPI])
+@pytest.mark.parametrize("cls", [RandomShooting, CEM, MPPI, GradientMPC])
 def test_rollout(cls: type[Planner]) -> None:
     policy = make_policy(cls)
     env = prepared(make_env(6), policy)

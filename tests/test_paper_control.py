@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -14,6 +15,7 @@ from torchrl_vjepa import (
     BJEPA,
     DiagGaussianHead,
     GaussianPrior,
+    GradientMPC,
     LatentEnv,
     Predictor,
     TargetScale,
@@ -21,6 +23,7 @@ from torchrl_vjepa import (
     linear_encoder,
     quadratic_cost,
 )
+from torchrl_vjepa.planners import Proposal
 
 A = torch.tensor([[0.9, 0.3], [-0.2, 0.8]], dtype=torch.float64)
 B = torch.tensor([[1.0], [0.5]], dtype=torch.float64)
@@ -126,3 +129,47 @@ def test_thm_bjepa_map_optimal(aim: float) -> None:
     b = gain @ B
     best = -(b.mT @ Q @ (at_zero - GOAL)) / (b.mT @ Q @ b + EFFORT)
     assert abs(GRID[mean.argmin()] - best.clamp(-2, 2)).item() <= 0.05
+
+
+@pytest.mark.parametrize("steps", [5, 400])
+def test_alg_bjepa_mpc(steps: int) -> None:
+    """The algorithm as printed: mean rollout, energy of the task, control cost, gradient step."""
+    model, horizon, alpha = make_model(), 3, 0.05
+    prior = GaussianPrior(2, mean=GOAL, std=torch.tensor([0.5, 1.0])).double().requires_grad_(False)
+
+    def energy(latent: Tensor, action: Tensor) -> Tensor:
+        return prior.energy(latent)
+
+    env = LatentEnv(
+        model,
+        action_spec=Bounded(-2, 2, (1,), dtype=torch.float64),
+        cost=EFFORT * action_cost() + energy,
+    )
+    sgd = functools.partial(torch.optim.SGD, lr=alpha)
+    planner = GradientMPC(env, horizon, steps, optimizer=sgd, num_starts=1)
+    start = torch.zeros(horizon, 1, dtype=torch.float64)
+    plan = planner.plan(LATENT, Proposal(start, torch.ones_like(start))).actions
+    assert all(parameter.grad is None for parameter in model.parameters())
+    u = start
+    for _ in range(steps):
+        u.requires_grad_()
+        z, total = LATENT, torch.zeros((), dtype=torch.float64)
+        for k in range(horizon):
+            z = model.predictor.dist(z, u[k]).mean
+            total = total + energy(z, u[k]) + EFFORT * u[k].square().sum()
+        u = u.detach() - alpha * torch.autograd.grad(total, u)[0]
+    # At the minimum, which of two plans is the better is a matter of rounding.
+    torch.testing.assert_close(plan, u, rtol=0, atol=1e-12 if steps == 5 else 1e-6)
+    if steps == 5:
+        return
+    # Energies of a Gaussian are quadratic, |P (z - g)|^2 / 2 + constant: least squares.
+    root = (torch.tensor([2.0, 1.0], dtype=torch.float64) / 2**0.5).diag()
+    powers = [torch.linalg.matrix_power(A, k) for k in range(horizon + 1)]
+    rows = [
+        torch.cat([root @ powers[k - j] @ B if j <= k else torch.zeros_like(B) for j in range(horizon)], 1)
+        for k in range(horizon)
+    ]
+    target = [root @ (GOAL - powers[k + 1] @ LATENT) for k in range(horizon)]
+    matrix = torch.cat([*rows, EFFORT**0.5 * torch.eye(horizon, dtype=torch.float64)])
+    best = torch.linalg.lstsq(matrix, torch.cat([*target, start.flatten()]).unsqueeze(-1)).solution
+    torch.testing.assert_close(plan, best, rtol=0, atol=1e-6)

@@ -38,6 +38,7 @@ from torchrl_vjepa.planners import (
     CEM,
     MPPI,
     EnvObjective,
+    GradientMPC,
     Planner,
     Proposal,
     RandomShooting,
@@ -55,8 +56,16 @@ from torchrl_vjepa.risk import (
 
 PLANNERS = [RandomShooting, CEM, MPPI]
 REFINING = [CEM, MPPI]
+ALL = [*PLANNERS, GradientMPC]  # what does not depend on how a planner searches
 A_MATRIX = torch.tensor([[0.9, 0.3], [-0.3, 0.9]])
 B_MATRIX = torch.tensor([[1.0, 0.0], [0.5, 1.0]])
+
+
+def sized(cls: type[Planner], optim_steps: int, num_candidates: int) -> dict[str, int]:
+    """Rounds of many candidates, or as many gradient steps as do the same."""
+    if cls is GradientMPC:
+        return {"optim_steps": 60, "num_starts": 2}
+    return {"optim_steps": optim_steps, "num_candidates": num_candidates}
 
 
 def linear(latent: Tensor, action: Tensor) -> Delta:
@@ -189,7 +198,7 @@ class TestOracles:
         assert torch.equal(out["action"], recorder.actions[-1][:, 0, 0])
         assert out["action"].abs().sum() > 0
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     def test_bounds_hold_where_the_optimum_is_outside(self, cls: type[Planner]) -> None:
         env = reach_env(50.0, Bounded(torch.tensor([-1.0, 2.0]), torch.tensor([1.0, 3.0]), (2,)))
         planner = cls(env, 2, optim_steps=6, seed=0)
@@ -348,7 +357,7 @@ class TestDefects:
         out = planner(TensorDict(latent=torch.zeros(1)))
         torch.testing.assert_close(out["plan_stats", "std"], torch.full((2, 1), 0.05 * 0.5 * 4))
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     @pytest.mark.parametrize("shape", [(), (1,), (2, 3)])
     @pytest.mark.parametrize("key", ["action", ("agent", "control")])
     @pytest.mark.parametrize("batch", [(), (2,), (2, 1)])
@@ -364,7 +373,7 @@ class TestDefects:
             action_key=key,
         )
         td = TensorDict(latent=torch.zeros(*batch, dim), batch_size=batch)
-        planner = cls(env, 2, 8, 256, seed=0, return_stats=True)
+        planner = cls(env, 2, **sized(cls, 8, 256), seed=0, return_stats=True)
         out = planner(td)
         assert out[key].shape == (*batch, *shape)
         assert out["next", "plan"].shape == (*batch, 2, *shape)
@@ -414,7 +423,7 @@ class TestDefects:
         assert all(p.grad is None and p.requires_grad for p in model.parameters())
         assert all(torch.equal(before[k], v) for k, v in model.state_dict().items())
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     def test_6_own_generator(self, cls: type[Planner]) -> None:
         before = torch.get_rng_state()
         one, two, other = (cls(lqr_env(), 3, seed=s) for s in (3, 3, 4))
@@ -434,7 +443,7 @@ class TestDefects:
         torch.manual_seed(11)
         assert torch.equal(first, MPPI(lqr_env(), 3)(states(3))["action"])
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     def test_6_statistics_on_request(self, cls: type[Planner]) -> None:
         env = lqr_env()
         out = cls(env, 3, return_stats=True, seed=0)(states(4))
@@ -593,7 +602,7 @@ class TestPromises:
         assert all(spec.is_in(action) for action in out["action"])
         assert all(spec.is_in(action) for action in out["next", "plan"].flatten(0, 1))
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     def test_planning_at_once_equals_planning_one_by_one_in_any_order(self, cls: type[Planner]) -> None:
         planner = cls(lqr_env(), 4, seed=0)
         td = states(8)
@@ -649,7 +658,7 @@ class TestPromises:
         assert torch.equal(candidates[:, 1], best)
         assert candidates[:, 2].abs().sum() > 0
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
     def test_copies_continue_the_same_stream(self, cls: type[Planner], duplicate: Any) -> None:
         planner = cls(lqr_env(), 3, seed=0)
@@ -771,16 +780,13 @@ class TestWarmStart:
         assert torch.equal(following[:, :-1], plan[:, 1:])
         assert torch.equal(following[:, -1], plan[:, -1])
 
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     def test_a_perfect_plan_is_kept(self, cls: type[Planner]) -> None:
         td = states(3)
         perfect = lqr_plan(td["latent"], 4)
         td["plan"] = perfect
-        planner = (
-            cls(lqr_env(), 4, 1, 64, output="best", seed=0)
-            if cls in REFINING
-            else cls(lqr_env(), 4, num_candidates=64, seed=0)
-        )
+        best = {"output": "best"} if cls in REFINING else {}
+        planner = cls(lqr_env(), 4, **sized(cls, 1, 64), **best, seed=0)
         torch.testing.assert_close(planner(td)["action"], perfect[:, 0])
 
     def test_is_init_clears_its_row_and_no_other(self) -> None:
@@ -891,7 +897,7 @@ class TestEnvObjective:
             objective.objective(objective.planning_state(td), actions),
             lqr_env(cost=quadratic_cost(torch.ones(2))).objective(td["latent"], actions),
         )
-        for cls in PLANNERS:
+        for cls in ALL:
             one = cls(WrapperEnv(), 3, seed=0)(states(3))["action"]
             two = cls(lqr_env(cost=quadratic_cost(torch.ones(2))), 3, seed=0)(states(3))["action"]
             torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-4)
@@ -1002,10 +1008,10 @@ RISKS = [expectation, mean_variance(0.5), cvar(0.2), entropic(1.0), worst_case]
 
 
 class TestRisk:
-    @pytest.mark.parametrize("cls", PLANNERS)
+    @pytest.mark.parametrize("cls", ALL)
     @pytest.mark.parametrize("risk", RISKS)
     def test_of_the_planner_equals_that_of_the_environment(self, cls: type[Planner], risk: Any) -> None:
-        settings = {"planning_horizon": 2, "num_candidates": 32, "seed": 0}
+        settings = {"planning_horizon": 2, "seed": 0, **sized(cls, 4, 32)}
         one = cls(lqr_env(model=noisy), **settings, num_samples=16, risk=risk)(states(3))
         env = lqr_env(model=noisy, how="sample", num_samples=16, risk=risk)
         two = cls(env, **settings)(states(3))

@@ -96,7 +96,16 @@ from torchrl_vjepa.objectives import (
     WindowLoss,
     select_best,
 )
-from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting, SamplingPlanner
+from torchrl_vjepa.planners import (
+    CEM,
+    MPPI,
+    EnvObjective,
+    GradientMPC,
+    Planner,
+    Proposal,
+    RandomShooting,
+    SamplingPlanner,
+)
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import BoundPrior, GaussianPrior, Prior
 from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
@@ -134,6 +143,7 @@ __all__ = [
     "Fusion",
     "GaussianFactor",
     "GaussianPrior",
+    "GradientMPC",
     "Head",
     "JEPA",
     "JEPALoss",

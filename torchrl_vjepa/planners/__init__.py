@@ -3,9 +3,20 @@
 from torchrl_vjepa.planners.base import Plan, Planner
 from torchrl_vjepa.planners.cem import CEM
 from torchrl_vjepa.planners.env_objective import EnvObjective
+from torchrl_vjepa.planners.gradient import GradientMPC
 from torchrl_vjepa.planners.mppi import MPPI
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.random_shooting import RandomShooting
 from torchrl_vjepa.planners.sampling import SamplingPlanner
 
-__all__ = ["CEM", "MPPI", "EnvObjective", "Plan", "Planner", "Proposal", "RandomShooting", "SamplingPlanner"]
+__all__ = [
+    "CEM",
+    "MPPI",
+    "EnvObjective",
+    "GradientMPC",
+    "Plan",
+    "Planner",
+    "Proposal",
+    "RandomShooting",
+    "SamplingPlanner",
+]
