@@ -89,7 +89,24 @@ from torchrl_vjepa.objectives import (
 )
 from torchrl_vjepa.planners import CEM, MPPI, EnvObjective, Planner, Proposal, RandomShooting
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
-from torchrl_vjepa.priors import BoundPrior, GaussianPrior, Prior
+from torchrl_vjepa.priors import (
+    Ball,
+    BoundPrior,
+    Box,
+    EnergyPrior,
+    GaussianPrior,
+    GoalPrior,
+    HalfSpace,
+    Prior,
+    ProbedPrior,
+    ProductPrior,
+    Region,
+    RegionPrior,
+    SlownessPrior,
+    SparsityPrior,
+    TimeIndexedPrior,
+    trajectory_prior,
+)
 from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.temperature import temper
@@ -99,9 +116,11 @@ __all__ = [
     "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
+    "Ball",
     "BatchedForkEnv",
     "BatchedNoisyTVEnv",
     "BoundPrior",
+    "Box",
     "CEM",
     "Calibration",
     "ChanceConstraint",
@@ -113,6 +132,7 @@ __all__ = [
     "DeltaHead",
     "Density",
     "DiagGaussianHead",
+    "EnergyPrior",
     "Ensemble",
     "EnsembleHead",
     "EnvObjective",
@@ -123,6 +143,8 @@ __all__ = [
     "FusedPredictor",
     "GaussianFactor",
     "GaussianPrior",
+    "GoalPrior",
+    "HalfSpace",
     "Head",
     "JEPA",
     "JEPALoss",
@@ -149,14 +171,21 @@ __all__ = [
     "Planner",
     "Predictor",
     "Prior",
+    "ProbedPrior",
+    "ProductPrior",
     "Proposal",
     "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",
+    "Region",
+    "RegionPrior",
     "ReliabilityCurve",
     "RewardLoss",
     "Selection",
+    "SlownessPrior",
+    "SparsityPrior",
     "TargetScale",
+    "TimeIndexedPrior",
     "VAE",
     "VAELoss",
     "VJEPA",
@@ -206,5 +235,6 @@ __all__ = [
     "surprise",
     "systematic_resampling",
     "temper",
+    "trajectory_prior",
     "worst_case",
 ]
