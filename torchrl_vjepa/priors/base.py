@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
+from typing import TypeAlias
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
@@ -14,9 +15,9 @@ from torchrl_vjepa.distributions import Density, GaussianFactor
 __all__ = ["BoundPrior", "LatentDensity", "Prior", "Task", "check_density"]
 
 #: What a prior is told: its own task, or the entries of a tensordict of which it takes its own.
-Task = Tensor | Mapping[NestedKey, Tensor] | TensorDictBase | None
+Task: TypeAlias = Tensor | Mapping[NestedKey, Tensor] | TensorDictBase | None
 #: What a prior gives: something with ``log_prob``, normalised or not.
-LatentDensity = Distribution | GaussianFactor | Density
+LatentDensity: TypeAlias = Distribution | GaussianFactor | Density
 
 
 class Prior(nn.Module, abc.ABC):

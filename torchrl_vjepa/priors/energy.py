@@ -91,7 +91,7 @@ class EnergyPrior(Prior):
         return value if self.weight == 1.0 or not isinstance(value, Tensor) else self.weight * value
 
     def bind(self, task: Task) -> BoundPrior:
-        """See :meth:`Prior.bind`; tries the energy first if ``latent_dim`` is known.
+        """See :meth:`Prior.bind`; tries the energy too if ``latent_dim`` is known.
 
         Args:
             task: what :meth:`forward` is called with from now on.
@@ -99,9 +99,10 @@ class EnergyPrior(Prior):
         Returns:
             A prior that shares its parameters with this one.
         """
+        bound = super().bind(task)
         if self.latent_dim is not None:
             self.check(task)
-        return super().bind(task)
+        return bound
 
     def check(self, task: Task = None) -> None:
         """Try the energy on a few latents of moderate size.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import TypeAlias
 
 from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModuleBase
@@ -16,7 +17,7 @@ from torchrl_vjepa.priors.base import Prior, Task
 
 __all__ = ["GoalPrior"]
 
-Mapper = TensorDictModuleBase | Callable[[Tensor], Tensor | Distribution]
+Mapper: TypeAlias = TensorDictModuleBase | Callable[[Tensor], Tensor | Distribution]
 
 
 class GoalPrior(Prior):

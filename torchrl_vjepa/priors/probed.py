@@ -147,18 +147,19 @@ class ProbedPrior(Prior):
             root = _inverse_root(p)
             precision = root.mT @ root
             return self._factor(p, precision, (precision @ p.mean.unsqueeze(-1)).squeeze(-1))
-        loc = (p.mean - self.offset) @ self.inverse.mT
-        root = self.inverse.to(p.mean.dtype) @ _root(p)
+        inverse = self.inverse.to(p.mean.dtype)
+        loc = (p.mean - self.offset.to(p.mean.dtype)) @ inverse.mT
+        root = inverse @ _root(p)
         upper = torch.linalg.qr(root.mT).R  # a triangular root, without squaring the condition
         sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper.dtype)
         return full_gaussian(loc, (sign.unsqueeze(-1) * upper).mT)
 
     def _factor(self, p: Any, precision: Tensor, information: Tensor) -> GaussianFactor:
         """In latents; ``precision`` and ``information`` are those of the coordinate."""
-        information = information - precision @ self.offset
+        matrix, offset = self.matrix.to(precision.dtype), self.offset.to(precision.dtype)
         return _PulledGaussian(
-            self.matrix.mT @ precision @ self.matrix,
-            information @ self.matrix,
+            matrix.mT @ precision @ matrix,
+            (information - precision @ offset) @ matrix,
             lambda latent: self._log_prob(p, latent),
         )
 

@@ -116,13 +116,13 @@ class HalfSpace(Region):
         normal = _point("normal", normal)
         super().__init__(len(normal))
         length = torch.linalg.vector_norm(normal)
-        offset = finite_vector("offset", offset)
-        if not length > 0 or not length.isfinite() or offset.ndim:
+        shift = finite_vector("offset", offset)
+        if not length > 0 or not length.isfinite() or shift.ndim:
             raise ValueError(
                 f"normal must be no zero vector and offset one number, got {normal.tolist()} and {offset}"
             )
         self.register_buffer("normal", normal / length)
-        self.register_buffer("offset", offset / length)
+        self.register_buffer("offset", shift / length)
 
     def _signed_distance(self, x: Tensor) -> Tensor:
         return (x * self.normal).sum(-1) - self.offset

@@ -105,9 +105,8 @@ class TimeIndexedPrior(Prior):
             KeyError: if the entry is missing.
             ValueError: if it has too few dimensions, or fewer steps than ``H``.
         """
-        (item,) = super().along(tasks, batch_ndim, horizon).items()
-        key, time = item
-        if tasks.get(key).ndim > batch_ndim + 1:
+        ((key, time),) = super().along(tasks, batch_ndim, horizon).items()
+        if tasks[key].ndim > batch_ndim + 1:
             return {key: time}
         return {key: time + torch.arange(1, horizon + 1, device=time.device).unsqueeze(-1)}
 
