@@ -57,14 +57,7 @@ from torchrl_vjepa.distributions import (
 from torchrl_vjepa.encoders import history_encoder, linear_encoder, mlp_encoder
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.fork import BatchedForkEnv, ForkEnv, ForkSystem
-from torchrl_vjepa.fusion import (
-    FusedBelief,
-    Fusion,
-    VirtualObservation,
-    fuse,
-    map_estimate,
-    sample_posterior,
-)
+from torchrl_vjepa.fusion import FusedBelief, Fusion, VirtualObservation, fuse, map_estimate, sample_posterior
 from torchrl_vjepa.heads import (
     DeltaHead,
     DiagGaussianHead,
@@ -107,7 +100,24 @@ from torchrl_vjepa.planners import (
     SamplingPlanner,
 )
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
-from torchrl_vjepa.priors import BoundPrior, GaussianPrior, Prior
+from torchrl_vjepa.priors import (
+    Ball,
+    BoundPrior,
+    Box,
+    EnergyPrior,
+    GaussianPrior,
+    GoalPrior,
+    HalfSpace,
+    Prior,
+    ProbedPrior,
+    ProductPrior,
+    Region,
+    RegionPrior,
+    SlownessPrior,
+    SparsityPrior,
+    TimeIndexedPrior,
+    trajectory_prior,
+)
 from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.temperature import temper
@@ -117,9 +127,11 @@ __all__ = [
     "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
+    "Ball",
     "BatchedForkEnv",
     "BatchedNoisyTVEnv",
     "BoundPrior",
+    "Box",
     "CEM",
     "Calibration",
     "ChanceConstraint",
@@ -131,6 +143,7 @@ __all__ = [
     "DeltaHead",
     "Density",
     "DiagGaussianHead",
+    "EnergyPrior",
     "Ensemble",
     "EnsembleHead",
     "EnvObjective",
@@ -143,7 +156,9 @@ __all__ = [
     "Fusion",
     "GaussianFactor",
     "GaussianPrior",
+    "GoalPrior",
     "GradientMPC",
+    "HalfSpace",
     "Head",
     "JEPA",
     "JEPALoss",
@@ -170,15 +185,22 @@ __all__ = [
     "Planner",
     "Predictor",
     "Prior",
+    "ProbedPrior",
+    "ProductPrior",
     "Proposal",
     "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",
+    "Region",
+    "RegionPrior",
     "ReliabilityCurve",
     "RewardLoss",
     "SamplingPlanner",
     "Selection",
+    "SlownessPrior",
+    "SparsityPrior",
     "TargetScale",
+    "TimeIndexedPrior",
     "VAE",
     "VAELoss",
     "VJEPA",
@@ -233,5 +255,6 @@ __all__ = [
     "surprise",
     "systematic_resampling",
     "temper",
+    "trajectory_prior",
     "worst_case",
 ]

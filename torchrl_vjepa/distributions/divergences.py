@@ -17,6 +17,7 @@ from torch.distributions import (
 from torch.distributions import kl_divergence as _torch_kl
 
 from torchrl_vjepa.distributions.delta import Delta
+from torchrl_vjepa.distributions.densities import Density, GaussianFactor
 from torchrl_vjepa.distributions.gaussians import DiagGaussian, LowRankGaussian
 from torchrl_vjepa.distributions.mixtures import Mixture
 from torchrl_vjepa.distributions.noise import NoiseDistribution, full_precision
@@ -45,7 +46,7 @@ class Estimate(NamedTuple):
 
 def kl_divergence(
     p: Distribution,
-    q: Distribution,
+    q: Distribution | GaussianFactor | Density,
     *,
     num_samples: int | None = None,
     generator: torch.Generator | None = None,
@@ -56,6 +57,11 @@ def kl_divergence(
     torch knows; where there is none (mixtures, flows) and ``num_samples`` says so, by
     :func:`monte_carlo_kl`.
 
+    Of a ``q`` that is not normalised it is the divergence up to the constant :math:`\log \int q`, which
+    moves no gradient of ``p``: :math:`-H(p) - \mathbb E_p[\log q(Z)]`. For a Gaussian ``p`` and a
+    :class:`GaussianFactor` that has a closed form too, and of a :class:`Density` the energy alone is
+    sampled.
+
     .. math::
         \mathrm{KL} = \tfrac12 \big[\mathrm{tr}(\Sigma_q^{-1} \Sigma_p)
         + (\mu_q - \mu_p)^\top \Sigma_q^{-1} (\mu_q - \mu_p) - D
@@ -63,7 +69,7 @@ def kl_divergence(
 
     Args:
         p: batch ``*B`` and event ``(D,)``.
-        q: the same event; its batch broadcasts with ``*B``.
+        q: the same event; its batch broadcasts with ``*B``. Normalised or not.
         num_samples: draws of the estimator where there is no closed form; ``None`` refuses instead.
         generator: source of randomness of the estimator.
 
@@ -82,12 +88,27 @@ def kl_divergence(
         torch.Size([5])
     """
     _check_pair(p, q)
-    if _is_gaussian(p) and _is_gaussian(q):
-        return _gaussian_kl(p, q)
-    try:
-        return _torch_kl(p, q)
-    except NotImplementedError:
-        pass
+    if isinstance(q, Density) and _is_gaussian(p):
+        rest = (
+            -p.entropy()
+            if q.base is None
+            else kl_divergence(p, q.base, num_samples=num_samples, generator=generator)
+        )
+        if q.energy is None:
+            return rest
+        if num_samples is not None:
+            return rest + _expectation(p, q.checked_energy, num_samples, generator).value
+    elif isinstance(q, GaussianFactor) and _is_gaussian(p):
+        root = _root(p)
+        trace = (root * (q.precision.to(root.dtype) @ root)).sum((-1, -2))
+        return 0.5 * trace.to(p.mean.dtype) - q.log_prob(p.mean) - p.entropy()
+    elif isinstance(q, Distribution):
+        if _is_gaussian(p) and _is_gaussian(q):
+            return _gaussian_kl(p, q)
+        try:
+            return _torch_kl(p, q)
+        except NotImplementedError:
+            pass
     if num_samples is None:
         raise TypeError(
             f"p and q must be a pair with a closed form, got {type(p).__name__} and {type(q).__name__}; "
@@ -97,9 +118,15 @@ def kl_divergence(
 
 
 def monte_carlo_kl(
-    p: Distribution, q: Distribution, num_samples: int = 64, *, generator: torch.Generator | None = None
+    p: Distribution,
+    q: Distribution | GaussianFactor | Density,
+    num_samples: int = 64,
+    *,
+    generator: torch.Generator | None = None,
 ) -> Estimate:
     r"""Unbiased estimate of :math:`\mathrm{KL}(p \,\|\, q)` and its standard error.
+
+    (Of a ``q`` that is not normalised, up to the logarithm of its integral.)
 
     :math:`\frac1M \sum_m \log p(Z^{(m)}) - \log q(Z^{(m)})`. Draws of a mixture are stratified, each
     component has :math:`M` of its own: less variance, and gradients of the weights are exact sums.
@@ -310,15 +337,17 @@ def _is_gaussian(p: Distribution) -> bool:
     return _is_diagonal(p) or isinstance(p, (MultivariateNormal, LowRankMultivariateNormal, LowRankGaussian))
 
 
-def _check_pair(p: Distribution, q: Distribution) -> None:
+def _check_pair(p: Distribution, q: Distribution | GaussianFactor | Density) -> None:
     _check_density(p, "p")
     _check_density(q, "q")
+    if isinstance(q, Density):
+        return
     if p.event_shape != q.event_shape:
         raise ValueError(
             f"p and q must have the same event shape, got {tuple(p.event_shape)} and {tuple(q.event_shape)}"
         )
 
 
-def _check_density(p: Distribution, name: str) -> None:
+def _check_density(p: Distribution | GaussianFactor | Density, name: str) -> None:
     if isinstance(p, Delta):
         raise TypeError(f"{name} must have a density, got a point mass (Delta)")

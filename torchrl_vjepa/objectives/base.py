@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections.abc import Iterator, Sequence
@@ -143,6 +144,31 @@ class LatentPredictionLoss(WindowLoss):
         self.collapse_rank = float(collapse_rank)
         self._calls = 0
         self._warned = False
+
+    def target_encoder(self, index: int | None = None) -> TensorDictModuleBase:
+        r"""The target encoder :math:`f_{\theta'}` as it is now: what maps a goal observation to a latent.
+
+        Args:
+            index: of which model, if the loss was given a list.
+
+        Returns:
+            A copy of the encoder with the averaged parameters, frozen and in evaluation mode.
+
+        Raises:
+            ValueError: if ``index`` is missing for a list, given for a single model, or out of range.
+
+        Examples:
+            >>> from torchrl.objectives import SoftUpdate
+            >>> from torchrl_vjepa import JEPA, GoalPrior, JEPALoss, Predictor, linear_encoder
+            >>> loss = JEPALoss(JEPA(linear_encoder(20, 4), Predictor(4)))
+            >>> updater = SoftUpdate(loss, eps=0.99)
+            >>> goal = GoalPrior(loss.target_encoder(), std=0.1)
+        """
+        encoder = copy.deepcopy(self._model_at(index).encoder)
+        params = self._target_params()
+        own = TensorDict.from_module(encoder)
+        own.data.update_(params.data if index is None else params.data[index])
+        return encoder.requires_grad_(False).eval()
 
     def _required_keys(self) -> list[NestedKey]:
         return [self.encoder.in_keys[0], *self.predictor.in_keys[1:]]

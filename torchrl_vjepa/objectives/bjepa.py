@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase, TensorDictParams
 from torch import Tensor
 
@@ -13,6 +13,7 @@ from torchrl_vjepa.distributions import kl_divergence
 from torchrl_vjepa.models import BJEPA
 from torchrl_vjepa.objectives.pairs import Pairs
 from torchrl_vjepa.objectives.vjepa import VJEPALoss
+from torchrl_vjepa.priors import Prior
 
 __all__ = ["BJEPALoss"]
 
@@ -24,8 +25,11 @@ class BJEPALoss(VJEPALoss):
         \mathcal L_{\text{BJEPA}} = \mathcal L_{\text{VJEPA}} + \gamma \sum_\Delta w_\Delta\,
         \mathbb E\, \mathrm{KL}\big(p_{\text{like}}(Z_T \mid Z_C) \,\|\, p_{\text{struct}}(Z_T)\big)
 
-    :math:`p_{\text{struct}}` is the model's ``structural_prior``; a learned one moves with this term
-    alone. The reference prior of the :math:`\beta` term is :math:`\mathcal N(0, I)`.
+    :math:`p_{\text{struct}}` is the model's ``structural_prior``: any with a log-density, also one that is
+    not normalised (the term is then known up to a constant). A learned one moves with this term alone.
+    One that takes a task takes the context latent :math:`Z_C` of each pair
+    (:class:`~torchrl_vjepa.priors.SlownessPrior`), as the encoder gives it, gradient included.
+    The reference prior of the :math:`\beta` term is :math:`\mathcal N(0, I)`.
 
     Entries: those of :class:`VJEPALoss` and ``loss_structural_kl``; diagnostic ``structural_kl``
     (in nats, without :math:`\gamma`).
@@ -34,13 +38,13 @@ class BJEPALoss(VJEPALoss):
         model: the model, or a list of models that train as one batch.
         structural_kl_coeff: :math:`\gamma`.
         num_kl_samples: draws of the unbiased estimate of the divergence where there is no closed form
-            (mixtures, ensembles and flows; see
+            (mixtures, ensembles and flows, and energies as priors; see
             :func:`~torchrl_vjepa.distributions.monte_carlo_kl`), at least 2.
         **kwargs: see :class:`VJEPALoss`.
 
     Raises:
-        ValueError: if a coefficient is negative or not finite, ``num_kl_samples`` is below 2, or an option
-            is unknown.
+        ValueError: if a coefficient is negative or not finite, ``num_kl_samples`` is below 2, an option
+            is unknown, or the structural prior needs another task than the context.
 
     Examples:
         >>> import torch
@@ -72,6 +76,13 @@ class BJEPALoss(VJEPALoss):
     ) -> None:
         if num_kl_samples < 2:
             raise ValueError(f"num_kl_samples must be at least 2, got {num_kl_samples}")
+        for m in self._checked(model):
+            needed = [unravel_key(key) for key in getattr(m.structural_prior, "in_keys", [])]
+            if any(key != unravel_key(m.latent_key) for key in needed):
+                raise ValueError(
+                    f"structural_prior must read the context latent {m.latent_key!r} or nothing, got "
+                    f"in_keys={needed}; bind(task) fixes any other task"
+                )
         super().__init__(model, **kwargs)
         self.num_kl_samples = int(num_kl_samples)
         self._register_coeff("structural_kl_coeff", structural_kl_coeff)
@@ -87,8 +98,12 @@ class BJEPALoss(VJEPALoss):
     def _pair_outputs(self, pairs: Pairs, params: dict[str, TensorDictBase]) -> dict[str, Tensor]:
         outputs = super()._pair_outputs(pairs, params)
         with params["prior"].to_module(self.prior):
+            prior = self.prior.module
+            task = {unravel_key(self.predictor.latent_key): pairs.context}
             outputs["structural"] = kl_divergence(
-                pairs.dist, self.prior.module(), num_samples=self.num_kl_samples
+                pairs.dist,
+                prior(task) if isinstance(prior, Prior) else prior(),
+                num_samples=self.num_kl_samples,
             )
         return outputs
 

@@ -284,12 +284,7 @@ class WindowLoss(LossModule):
         Raises:
             ValueError: if ``index`` is missing for a list, given for a single model, or out of range.
         """
-        models: list[Any] = self.__dict__["_models"]
-        if self.num_models is None and index is not None:
-            raise ValueError(f"index must be None for a single model, got {index}")
-        if self.num_models is not None and (index is None or not 0 <= index < self.num_models):
-            raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
-        model = models[index or 0]
+        model = self._model_at(index)
         for name, attribute in self._modules_of_model.items():
             params = getattr(self, f"{name}_params")
             own = TensorDict.from_module(getattr(model, attribute))
@@ -299,6 +294,15 @@ class WindowLoss(LossModule):
             for key, value in own.items(True, True):
                 value.requires_grad_(params.get(key).requires_grad)
         return model
+
+    def _model_at(self, index: int | None) -> Any:
+        """The model that was given, with whatever parameters it has now."""
+        models: list[Any] = self.__dict__["_models"]
+        if self.num_models is None and index is not None:
+            raise ValueError(f"index must be None for a single model, got {index}")
+        if self.num_models is not None and (index is None or not 0 <= index < self.num_models):
+            raise ValueError(f"index must be in [0, {self.num_models - 1}], got {index}")
+        return models[index or 0]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
+from typing import TypeAlias
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
@@ -11,12 +12,12 @@ from torch.distributions import Distribution
 
 from torchrl_vjepa.distributions import Density, GaussianFactor
 
-__all__ = ["BoundPrior", "LatentDensity", "Prior", "Task"]
+__all__ = ["BoundPrior", "LatentDensity", "Prior", "Task", "check_density"]
 
 #: What a prior is told: its own task, or the entries of a tensordict of which it takes its own.
-Task = Tensor | Mapping[NestedKey, Tensor] | TensorDictBase | None
+Task: TypeAlias = Tensor | Mapping[NestedKey, Tensor] | TensorDictBase | None
 #: What a prior gives: something with ``log_prob``, normalised or not.
-LatentDensity = Distribution | GaussianFactor | Density
+LatentDensity: TypeAlias = Distribution | GaussianFactor | Density
 
 
 class Prior(nn.Module, abc.ABC):
@@ -48,6 +49,9 @@ class Prior(nn.Module, abc.ABC):
         >>> prior.along({"goal": torch.zeros(5, 2)}, batch_ndim=1, horizon=3)["goal"].shape
         torch.Size([5, 1, 2])
     """
+
+    #: Whether its log-density has a gradient; else only planners that sample can use it.
+    differentiable: bool = True
 
     def __init__(
         self, *, task_key: NestedKey | None = None, task_ndim: int = 1, latent_dim: int | None = None
@@ -81,8 +85,20 @@ class Prior(nn.Module, abc.ABC):
 
         Returns:
             ``(*B)``, in nats.
+
+        Raises:
+            ValueError: if the latent has another size than the prior's.
         """
-        return self(task).log_prob(latent)
+        density = self(task)
+        size = self.latent_dim
+        if size is None and not isinstance(density, Density):
+            size = density.event_shape[-1]
+        if latent.ndim == 0 or (size is not None and latent.shape[-1] != size):
+            raise ValueError(
+                f"latent must have last dimension {size} for this {type(self).__name__}, "
+                f"got shape {tuple(latent.shape)}"
+            )
+        return density.log_prob(latent)
 
     def energy(self, latent: Tensor, task: Task = None) -> Tensor:
         r"""Energy :math:`E(Z; \eta) = -\log p_{\text{prior}}(Z \mid \eta)`, up to a constant.
@@ -139,11 +155,19 @@ class Prior(nn.Module, abc.ABC):
     def bind(self, task: Task) -> BoundPrior:
         """The same prior with its task inside: a prior that takes none.
 
+        The place where a task is looked at: calls with other tasks do not read values, which would make
+        a GPU wait.
+
         Args:
-            task: what :meth:`forward` is called with from now on.
+            task: what :meth:`forward` is called with from now on. What changes with time is a
+                :class:`TimeIndexedPrior`.
 
         Returns:
             A prior that shares its parameters with this one.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if the task is not finite, or the density that it gives has no finite moments.
         """
         return BoundPrior(self, task)
 
@@ -180,23 +204,50 @@ class BoundPrior(Prior):
 
     Args:
         prior: the prior.
-        task: its task; a buffer if it is one tensor, so ``.to(device)`` moves it.
+        task: its task, or a mapping that holds what the prior reads; kept in buffers, so
+            ``.to(device)`` moves it.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if the task is not finite, or the density that it gives has no finite moments.
 
     Examples:
         >>> import torch
-        >>> from torchrl_vjepa import GaussianPrior
-        >>> bound = BoundPrior(GaussianPrior(2), None)
-        >>> bound.energy(torch.zeros(2)).shape
-        torch.Size([])
+        >>> from torchrl_vjepa import GoalPrior
+        >>> bound = BoundPrior(GoalPrior(std=0.1), torch.ones(2))
+        >>> bound().mean, bound.in_keys
+        (tensor([1., 1.]), [])
     """
 
     def __init__(self, prior: Prior, task: Task) -> None:
         super().__init__(latent_dim=prior.latent_dim)
         self.prior = prior
+        self.differentiable = prior.differentiable
+        self._keys: list[NestedKey] | None = None
+        values: list[Tensor] = []
         if isinstance(task, Tensor):
-            self.register_buffer("task", task.detach().clone())
-        else:
-            self.task = task
+            values = [task]
+        elif task is not None:
+            self._keys = prior.in_keys
+            missing = [key for key in self._keys if task.get(key, None) is None]
+            if missing:
+                raise KeyError(f"task must hold the entries {self._keys}, but lacks {missing}")
+            values = [task.get(key) for key in self._keys]
+        for i, value in enumerate(values):
+            if not value.isfinite().all():
+                raise ValueError(f"task must be finite, got {value.tolist()}")
+            self.register_buffer(f"task_{i}", value.detach().clone())
+        self._num_tasks = len(values)
+        if values or not prior.in_keys:
+            check_density(self())
+
+    @property
+    def task(self) -> Task:
+        """The task that is fixed."""
+        values = [self.get_buffer(f"task_{i}") for i in range(self._num_tasks)]
+        if self._keys is not None:
+            return dict(zip(self._keys, values, strict=True))
+        return values[0] if values else None
 
     def forward(self, task: Task = None) -> LatentDensity:
         """The density of the task that is fixed.
@@ -208,3 +259,42 @@ class BoundPrior(Prior):
             The density.
         """
         return self.prior(self.task)
+
+
+def check_density(density: LatentDensity) -> None:
+    """Refuse a density whose moments overflow: contradictory or far too sharp experts.
+
+    Reads values, so it is for constructors and :meth:`Prior.bind`.
+
+    Args:
+        density: of any kind; energies are not looked at.
+
+    Raises:
+        ValueError: if a mean, standard deviation or precision is not finite, or a deviation is zero.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa import diag_gaussian
+        >>> check_density(diag_gaussian(torch.zeros(2), torch.tensor([1.0, 0.0])))
+        Traceback (most recent call last):
+        ...
+        ValueError: the prior's moments must be finite and its spread positive, ...
+    """
+    if isinstance(density, Density):
+        if density.base is not None:
+            check_density(density.base)
+        return
+    if isinstance(density, GaussianFactor):
+        sound = density.precision.isfinite().all() and density.information.isfinite().all()
+    else:
+        try:
+            mean, std = density.mean, density.stddev
+        except NotImplementedError:  # not every distribution knows them
+            return
+        # An infinite variance is no defect: heavy tails have it.
+        sound = mean.isfinite().all() and (std > 0).all()
+    if not sound:
+        raise ValueError(
+            "the prior's moments must be finite and its spread positive, but in this dtype they overflow: "
+            "the experts are too sharp, or contradict each other; widen a std or lower a weight"
+        )

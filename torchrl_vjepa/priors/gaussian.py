@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution, MultivariateNormal
 
 from torchrl_vjepa.distributions import diag_gaussian
+from torchrl_vjepa.priors.arguments import finite_vector, std_vector
 from torchrl_vjepa.priors.base import Prior, Task
 
 __all__ = ["GaussianPrior"]
@@ -26,8 +27,8 @@ class GaussianPrior(Prior):
         learnable: whether :math:`\mu` and :math:`\Sigma` are parameters.
 
     Raises:
-        ValueError: if a size or shape is wrong, ``std`` is not positive, or ``covariance`` is not
-            symmetric positive definite.
+        ValueError: if a size or shape is wrong, ``std`` is not positive or its precision overflows,
+            or ``covariance`` is not symmetric positive definite.
 
     Examples:
         >>> import torch
@@ -55,11 +56,9 @@ class GaussianPrior(Prior):
             raise ValueError(f"latent_dim must be positive, got {latent_dim}")
         if std is not None and covariance is not None:
             raise ValueError("at most one of std and covariance must be given, got both")
-        entries = {"mean": _vector("mean", mean, latent_dim)}
+        entries = {"mean": finite_vector("mean", mean, latent_dim)}
         if covariance is None:
-            scale = _vector("std", 1.0 if std is None else std, latent_dim)
-            if not (scale > 0).all():
-                raise ValueError(f"std must be positive, got {scale.tolist()}")
+            scale = std_vector("std", 1.0 if std is None else std, latent_dim)
             entries["log_var"] = 2 * scale.log()
         else:
             if tuple(covariance.shape) != (latent_dim, latent_dim):
@@ -107,12 +106,3 @@ class GaussianPrior(Prior):
             return diag_gaussian(mean, log_var=log_var)
         factor = self.lower.tril(-1) + torch.diag_embed(self.log_diagonal.exp())
         return MultivariateNormal(self.mean, scale_tril=factor, validate_args=False)
-
-
-def _vector(name: str, value: Tensor | float, size: int) -> Tensor:
-    vector = torch.as_tensor(value, dtype=torch.get_default_dtype())
-    if vector.ndim == 0:
-        vector = vector.expand(size)
-    if tuple(vector.shape) != (size,) or not vector.isfinite().all():
-        raise ValueError(f"{name} must be a finite number or a tensor of shape {(size,)}, got {value!r}")
-    return vector.detach()
