@@ -401,7 +401,11 @@ class TestEnvironment:
     @pytest.mark.parametrize(
         ("kwargs", "error", "message"),
         [
-            ({"cost": None}, ValueError, "exactly one of reward_model and cost .* got neither"),
+            (
+                {"cost": None},
+                ValueError,
+                "at least one of reward_model, cost and prior must be given, got none",
+            ),
             ({"how": "median"}, ValueError, "how must be 'mean', 'mode' or 'sample'"),
             ({"num_samples": 0}, ValueError, "num_samples must be at least 1"),
             ({"num_samples": 3}, ValueError, "1 unless how='sample', got 3"),
@@ -425,13 +429,17 @@ class TestEnvironment:
         with pytest.raises(error, match=message):
             make_env(kwargs.pop("model", point), **kwargs)
 
-    def test_both_reward_and_cost_are_refused(self) -> None:
-        with pytest.raises(ValueError, match="got both"):
-            make_env(reward_model=reward_module(), cost=quadratic_cost(torch.zeros(2)))
+    def test_reward_and_cost_add_up(self) -> None:
+        reward, cost = reward_module(), quadratic_cost(torch.zeros(2))
+        state, actions = torch.randn(3, 2), torch.randn(3, 5, 4, 2)
+        both = make_env(reward_model=reward, cost=cost).objective(state, actions)
+        apart = make_env(reward_model=reward).objective(state, actions)
+        apart = apart + make_env(cost=cost).objective(state, actions)
+        torch.testing.assert_close(both, apart)
 
     def test_missing_or_wrong_latent_is_named(self) -> None:
         env = make_env()
-        with pytest.raises(KeyError, match=r"needs the entry 'latent', got .*'pixels'"):
+        with pytest.raises(KeyError, match=r"needs the entries \['latent'\], got .*'pixels'"):
             env.planning_state(TensorDict(pixels=torch.zeros(3)))
         with pytest.raises(ValueError, match=r"shape \(\*B, 2\), got \(3,\)"):
             env.planning_state(TensorDict(latent=torch.zeros(3)))

@@ -423,7 +423,7 @@ def test_torchrl_planners_start_from_the_mean() -> None:
 
 def test_bad_beliefs_are_refused() -> None:
     env = world()
-    with pytest.raises(KeyError, match="planning needs the entry .*particles.*put the particle filter in"):
+    with pytest.raises(KeyError, match="planning needs the entries .*particles.*put the particle filter in"):
         env.planning_state(TensorDict(latent=torch.zeros(1)))
     belief = TensorDict(particles=torch.zeros(4, 2), log_weights=torch.zeros(4))
     with pytest.raises(ValueError, match=r"must have shape \(\*B, K, 1\), got \(4, 2\)"):

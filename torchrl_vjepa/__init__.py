@@ -13,7 +13,7 @@ from torchrl_vjepa.belief import (
     surprise,
     systematic_resampling,
 )
-from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, quadratic_cost
+from torchrl_vjepa.costs import Cost, QuadraticReward, action_cost, prior_cost, quadratic_cost
 from torchrl_vjepa.diagnostics import (
     Calibration,
     CredibleInterval,
@@ -118,7 +118,15 @@ from torchrl_vjepa.priors import (
     TimeIndexedPrior,
     trajectory_prior,
 )
-from torchrl_vjepa.risk import ChanceConstraint, cvar, entropic, expectation, mean_variance, worst_case
+from torchrl_vjepa.risk import (
+    ChanceConstraint,
+    cvar,
+    entropic,
+    expectation,
+    free_energy,
+    mean_variance,
+    worst_case,
+)
 from torchrl_vjepa.statistics import effective_rank, gaussian_entropy, sliced_gaussian_distance
 from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.whitening import Whitening
@@ -223,6 +231,7 @@ __all__ = [
     "entropic",
     "entropy_bounds",
     "expectation",
+    "free_energy",
     "full_gaussian",
     "fuse",
     "gaussian_entropy",
@@ -241,6 +250,7 @@ __all__ = [
     "mutual_information_bound",
     "pit_histogram",
     "point_estimate",
+    "prior_cost",
     "probability_integral_transform",
     "product_of_experts",
     "propagate_moments",

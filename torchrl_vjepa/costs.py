@@ -13,11 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from torchrl_vjepa.priors import Prior, Task
+
 __all__ = [
     "Cost",
     "QuadraticReward",
     "StageCost",
     "action_cost",
+    "prior_cost",
     "quadratic_cost",
 ]
 
@@ -159,6 +162,46 @@ class _ActionCost(Cost):
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
         return _quadratic_form(action, self.weight)
+
+
+class _PriorCost(Cost):
+    def __init__(self, prior: Prior) -> None:
+        super().__init__()
+        self.prior = prior
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return self.prior.energy(latent)
+
+
+def prior_cost(prior: Prior, task: Task = None) -> Cost:
+    r"""Energy of a prior as a cost, :math:`E(Z; \eta) = -\log p_{\text{prior}}(Z \mid \eta)`.
+
+    For scaled sums of energies whose tasks are fixed; tasks that change, by row or by step, are given to
+    ``LatentEnv(prior=...)``, which reads them from the tensordict.
+
+    Args:
+        prior: the prior.
+        task: :math:`\eta`, for a prior that takes one.
+
+    Returns:
+        The cost, in nats; it does not look at the action.
+
+    Raises:
+        ValueError: if the prior takes a task and there is none.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa import GaussianPrior
+        >>> cost = prior_cost(GaussianPrior(2)) + 0.1 * action_cost()
+        >>> cost(torch.zeros(3, 2), torch.zeros(3, 1)).shape
+        torch.Size([3])
+    """
+    if task is None and prior.in_keys:
+        raise ValueError(
+            f"task must be given for a prior that reads {prior.in_keys}, got None; or give the prior to "
+            "LatentEnv, which reads tasks from the tensordict"
+        )
+    return _PriorCost(prior if task is None else prior.bind(task))
 
 
 def quadratic_cost(target: Tensor, weight: Tensor | float | None = None) -> Cost:

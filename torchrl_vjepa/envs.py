@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
-from torchrl_vjepa.belief import resampling_index, rollout
-from torchrl_vjepa.common_random_numbers import CommonNoise
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
+from torchrl_vjepa.imagination import Tasks, densities, drawn, imagine, imagine_fused
 from torchrl_vjepa.latent_step import LatentStep
+from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 
 __all__ = ["LatentEnv"]
@@ -35,8 +35,20 @@ class LatentEnv(ModelBasedEnvBase):
     r"""The latent model as an environment: imagine trajectories, and plan in them.
 
     A step is :math:`Z_{t+1} \sim p_\phi(\cdot \mid Z_t, u_t)` (or its mean or mode) followed by the
-    reward of :math:`(Z_{t+1}, u_t)`: a reward model's, or minus a cost. The batch size is empty, so
-    tensordicts of any batch size go in. An imagined ``done`` never triggers a reset.
+    reward of :math:`(Z_{t+1}, u_t)`: a reward model's, minus a cost, minus the energy of a prior. The batch
+    size is empty, so tensordicts of any batch size go in. An imagined ``done`` never triggers a reset.
+
+    **Tasks are swapped, the model stays.** The ``prior`` says what is wanted; its task (a goal, the place of
+    an obstacle) is an entry of the tensordict that is planned from, one for each row, constant or
+    time-indexed: a new task is a new entry. How the prior enters a plan is ``fusion``:
+
+    - ``"energy"``: as a cost, :math:`-\sum_k \log p_{\text{prior}}(Z_{t+k} \mid \eta_{t+k})`, with the other
+      costs and under any risk (``alg:bjepa_mpc``).
+    - ``"weight"``: by posterior. A plan costs the free energy :math:`-\log \frac1M \sum_m e^{-J^{(m)}}` of
+      its ``M`` sampled trajectories: minus the log-probability that the dynamics satisfy the prior (and, with
+      costs, that :math:`e^{-c}` accepts). Control as inference: it hopes for lucky noise.
+    - ``"propose"``: the same number with less variance: trajectories are drawn from the fused transition,
+      and weighed by how far the prior had to pull them (:func:`~torchrl_vjepa.imagination.imagine_fused`).
 
     :meth:`objective` is the cost of whole plans on plain tensors (``eq:latent_mpc_objective``); the
     planners of this package call it, and TorchRL's own planners roll the environment out. How plans
@@ -52,8 +64,11 @@ class LatentEnv(ModelBasedEnvBase):
             real environment.
         reward_model: TensorDictModule that reads ``latent_key`` (the next latent) and
             ``action_key`` (in the shape of ``action_spec``) and writes ``reward_key`` with shape
-            ``(*B, 1)``. Either this or ``cost``.
-        cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; the reward is minus the cost.
+            ``(*B, 1)``.
+        cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; subtracted from the reward.
+        prior: of the task; its energy is subtracted from the reward. Of ``reward_model``, ``cost`` and
+            ``prior`` at least one must be given; what is given is added up.
+        fusion: how the prior enters the cost of a plan; all but ``"energy"`` need sampled trajectories.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
         num_samples: trajectories ``M`` per candidate plan for ``how="sample"`` (1 by default), or from ``M``
             particles of a belief with any ``how`` (64 by default). They share their
@@ -74,10 +89,11 @@ class LatentEnv(ModelBasedEnvBase):
         dtype: of the latent; by default the one of the model's parameters.
 
     Raises:
-        ValueError: if not exactly one of ``reward_model`` and ``cost`` is given, a size does not
+        ValueError: if none of ``reward_model``, ``cost`` and ``prior`` is given, a size does not
             fit, or a probe call returns a wrong shape.
         KeyError: if the reward model reads or writes other keys.
-        TypeError: if the model is no transition or the action specification no single tensor.
+        TypeError: if the model is no transition, the prior no ``Prior`` or the action specification no
+            single tensor.
 
     Examples:
         >>> import torch
@@ -106,6 +122,8 @@ class LatentEnv(ModelBasedEnvBase):
         action_spec: TensorSpec,
         reward_model: TensorDictModuleBase | None = None,
         cost: StageCost | None = None,
+        prior: Prior | None = None,
+        fusion: Literal["energy", "weight", "propose"] = "energy",
         how: Literal["mean", "mode", "sample"] = "mean",
         num_samples: int | None = None,
         risk: Risk | None = None,
@@ -118,11 +136,8 @@ class LatentEnv(ModelBasedEnvBase):
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
-        if (reward_model is None) == (cost is None):
-            raise ValueError(
-                "exactly one of reward_model and cost must be given, got "
-                f"{'neither' if cost is None else 'both'}"
-            )
+        if reward_model is None and cost is None and prior is None:
+            raise ValueError("at least one of reward_model, cost and prior must be given, got none")
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
         sampled = how == "sample" or belief_key is not None
@@ -159,8 +174,11 @@ class LatentEnv(ModelBasedEnvBase):
             )
         world_model = LatentStep(
             predictor, transition, reward_model, cost, how, spec.shape,
-            latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key),
+            latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key), prior=prior,
         )  # fmt: skip
+        prior_dim = getattr(prior, "latent_dim", None)
+        if prior_dim not in (None, latent_dim):
+            raise ValueError(f"prior must be over latents of size {latent_dim}, got latent_dim={prior_dim}")
         parameter = next((p for p in world_model.parameters() if p.is_floating_point()), None)
         if device is None:
             device = "cpu" if parameter is None else parameter.device
@@ -173,7 +191,9 @@ class LatentEnv(ModelBasedEnvBase):
         self.belief_key = None if belief_key is None else unravel_key(belief_key)
         if belief_key is not None:
             self.planning_keys = [unravel_key((belief_key, name)) for name in ("particles", "log_weights")]
-        self.how, self.num_samples, self.risk = how, num_samples, risk
+        self.task_keys = [] if prior is None else [unravel_key(key) for key in prior.in_keys]
+        self.planning_keys += self.task_keys
+        self.how, self.num_samples, self.risk, self.fusion = how, num_samples, risk, fusion
         self.constraints: Any = nn.ModuleList(constraints)  # registered: their modules move along
         self.rng: torch.Generator | None = None
         latent_spec = Unbounded((latent_dim,), device=self.device, dtype=dtype)
@@ -190,54 +210,67 @@ class LatentEnv(ModelBasedEnvBase):
         self.sampling()  # refuses what does not go together
 
     def planning_state(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
-        """Where imagination starts: the latent or the belief, and nothing else of the input.
+        """Where imagination starts: the latent or the belief, the tasks, and nothing else of the input.
 
         Args:
-            tensordict: holds the latent, or the belief if there is a ``belief_key``.
+            tensordict: holds the latent, or the belief if there is a ``belief_key``, and the entries that
+                the prior reads.
 
         Returns:
-            Latent of shape ``(*B, D)``; or a tensordict of batch size ``*B`` with ``particles
-            (K, D)`` and ``log_weights (K)``.
+            Latent of shape ``(*B, D)``; or a tensordict of batch size ``*B`` with ``latent (D)``, or
+            ``particles (K, D)`` and ``log_weights (K)``, and what the prior reads under ``tasks``.
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if its last dimension is not ``D``.
+            ValueError: if its last dimension is not ``D``, or a task lacks the batch dimensions.
         """
-        values = [tensordict.get(key, None) for key in self.planning_keys]
-        for key, value in zip(self.planning_keys, values, strict=True):
-            if value is None:
-                raise KeyError(
-                    f"planning needs the entry {key!r}, got a tensordict with "
-                    f"{sorted(map(str, tensordict.keys(True, True)))}; put the "
-                    f"{'encoder' if self.belief_key is None else 'particle filter'} in front"
-                )
-        start = values[0]
+        read = {key: tensordict.get(key, None) for key in self.planning_keys}
+        missing = [key for key, value in read.items() if value is None]
+        if missing:
+            advice = f"put the {'encoder' if self.belief_key is None else 'particle filter'} in front"
+            if missing[0] in self.task_keys:
+                advice = "put the task there, or give the environment prior.bind(task)"
+            got = sorted(map(str, tensordict.keys(True, True)))
+            raise KeyError(f"planning needs the entries {missing}, got a tensordict with {got}; {advice}")
+        start = read[self.planning_keys[0]]
         if start.shape[-1:] != (self.latent_dim,):
             lead = "(*B" if self.belief_key is None else "(*B, K"
             raise ValueError(
                 f"{self.planning_keys[0]!r} must have shape {lead}, {self.latent_dim}), "
                 f"got {tuple(start.shape)}"
             )
-        if self.belief_key is None:
+        state = {"latent": start}
+        batch = start.shape[:-1]
+        if self.belief_key is not None:
+            log_weights = read[self.planning_keys[1]]
+            if log_weights.shape != start.shape[:-1]:
+                raise ValueError(
+                    f"{self.planning_keys[1]!r} must have shape {tuple(start.shape[:-1])}, one for each "
+                    f"particle, got {tuple(log_weights.shape)}"
+                )
+            if not bool(log_weights.logsumexp(-1).isfinite().all()):
+                raise ValueError(
+                    f"{self.planning_keys[1]!r} must hold some weight in every row, got rows that are all "
+                    "zero or nan"
+                )
+            state, batch = {"particles": start, "log_weights": log_weights}, batch[:-1]
+        elif not self.task_keys:
             return start
-        if values[1].shape != start.shape[:-1]:
-            raise ValueError(
-                f"{self.planning_keys[1]!r} must have shape {tuple(start.shape[:-1])}, one for each "
-                f"particle, got {tuple(values[1].shape)}"
-            )
-        if not bool(values[1].logsumexp(-1).isfinite().all()):
-            raise ValueError(
-                f"{self.planning_keys[1]!r} must hold some weight in every row, got rows that are all "
-                "zero or nan"
-            )
-        names = ("particles", "log_weights")
-        return TensorDict(dict(zip(names, values, strict=True)), batch_size=start.shape[:-2])
+        tasks = {key: read[key] for key in self.task_keys}
+        for key, task in tasks.items():
+            if task.shape[: len(batch)] != batch:
+                raise ValueError(
+                    f"{key!r} must have the batch dimensions {tuple(batch)} in front, as the latent has, got "
+                    f"shape {tuple(task.shape)}; use bind(task) for one that all rows share"
+                )
+        return TensorDict({**state, "tasks": tasks}, batch_size=batch)
 
     def sampling(
         self,
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
+        fusion: Literal["energy", "weight", "propose"] | None = None,
     ) -> Sampling:
         """How plans are evaluated where this is asked for: the environment's own settings for the rest.
 
@@ -245,23 +278,33 @@ class LatentEnv(ModelBasedEnvBase):
             num_samples: trajectories per plan; ``None``: as many as the environment samples, if it does.
             risk: ``None``: the environment's.
             constraints: ``None``: the environment's.
+            fusion: ``None``: the environment's.
 
         Returns:
-            The settings together.
+            The settings together; planning by posterior has the risk
+            :func:`~torchrl_vjepa.risk.free_energy`.
 
         Raises:
-            ValueError: if ``num_samples`` is not positive, or a risk or constraint has no samples to read.
+            ValueError: if ``num_samples`` is not positive, a risk or constraint has no samples to read, or
+                planning by posterior has none, no prior, or another risk.
             TypeError: if ``risk`` is not callable or ``constraints`` holds something else.
         """
         sampled = self.how == "sample" or self.belief_key is not None
         own = self.num_samples if sampled else None
+        fusion = self.fusion if fusion is None else fusion
+        if fusion != "energy" and self.world_model.prior is None:
+            raise ValueError(f"fusion={fusion!r} needs a prior, got none; give one to LatentEnv")
         settings = Sampling.checked(
             own if num_samples is None else num_samples,
             self.risk if risk is None else risk,
             self.constraints if constraints is None else constraints,
+            fusion,
         )
-        judged = settings.constraints or settings.risk is not expectation
-        if judged and self.belief_key is not None and self.how != "sample":
+        if (
+            (settings.constraints or settings.risk is not expectation)
+            and self.belief_key is not None
+            and self.how != "sample"
+        ):
             raise ValueError(
                 "how must be 'sample' for a risk or a constraint on plans that start from a belief, got "
                 f"{self.how!r}: it would leave out the noise of the transitions"
@@ -277,6 +320,7 @@ class LatentEnv(ModelBasedEnvBase):
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
+        fusion: Literal["energy", "weight", "propose"] | None = None,
     ) -> Tensor:
         r"""Cost of candidate plans, :math:`\sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k})`.
 
@@ -289,6 +333,7 @@ class LatentEnv(ModelBasedEnvBase):
             num_samples: trajectories per plan; ``None``: as the environment does.
             risk: of their costs; ``None``: the environment's.
             constraints: on their latents and actions; ``None``: the environment's.
+            fusion: how the prior enters; ``None``: the environment's.
 
         Returns:
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
@@ -296,10 +341,23 @@ class LatentEnv(ModelBasedEnvBase):
         Raises:
             ValueError: if a shape does not fit, or what is asked for needs samples and has none.
         """
-        num_samples, risk, constraints = self.sampling(num_samples, risk, constraints)
-        latents, actions = self._imagine(state, actions, num_samples, generator)
-        costs = self.world_model.stage_cost(latents, actions).sum(dim=-1)
-        return costs if num_samples is None else plan_cost(costs, risk, constraints, latents, actions)
+        settings = self.sampling(num_samples, risk, constraints, fusion)
+        start, actions = self._start(state, actions, settings.num_samples, generator)
+        world_model = self.world_model
+        if settings.fusion == "propose":
+            prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
+            latents, evidence = imagine_fused(world_model.transition, start, actions, prior_at, generator)
+            own = world_model.own_cost(latents, actions)
+            costs = -evidence if own is None else own - evidence
+        else:
+            latents = imagine(
+                world_model.transition, start, actions, self._following(state, settings), generator
+            )
+            costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
+        costs = costs.sum(dim=-1)
+        if settings.num_samples is None:
+            return costs
+        return plan_cost(costs, settings.risk, settings.constraints, latents, actions)
 
     def violation_probability(
         self,
@@ -325,46 +383,62 @@ class LatentEnv(ModelBasedEnvBase):
         Raises:
             ValueError: if there are no constraints or no samples, or a shape does not fit.
         """
-        num_samples, _, constraints = self.sampling(num_samples, None, constraints)
-        if not constraints:
+        settings = self.sampling(num_samples, None, constraints)
+        if not settings.constraints:
             raise ValueError("constraints must hold at least one ChanceConstraint, got none")
-        latents, actions = self._imagine(state, actions, num_samples, generator)
-        return torch.stack([constraint(latents, actions) for constraint in constraints], dim=-1)
+        start, actions = self._start(state, actions, settings.num_samples, generator)
+        how = self._following(state, settings)
+        latents = imagine(self.world_model.transition, start, actions, how, generator)
+        return torch.stack([constraint(latents, actions) for constraint in settings.constraints], dim=-1)
 
-    def _imagine(
+    def _start(
         self,
         state: Tensor | TensorDictBase,
         actions: Tensor,
         num_samples: int | None,
         generator: torch.Generator | None,
     ) -> tuple[Tensor, Tensor]:
-        """Latents and actions, ``(*B, N, H, ...)``, or ``(M, *B, N, H, ...)`` where they are sampled."""
+        """First latents ``(*B, N, D)`` and actions ``(*B, N, H, A)``; with ``M`` in front where sampled."""
         batch, (num_candidates, _, action_dim) = actions.shape[:-3], actions.shape[-3:]
-        drawn = not isinstance(state, Tensor)
-        start = _drawn(state, num_samples or 1, generator) if drawn else state
-        if start.shape[drawn:] != (*batch, self.latent_dim) or action_dim != self.action_dim:
+        if isinstance(state, Tensor):
+            if self.task_keys:
+                raise KeyError(f"state must hold the tasks {self.task_keys} under 'tasks', got a tensor")
+            start = state
+        elif self.belief_key is None:
+            start = state.get("latent")
+        else:
+            start = drawn(state, num_samples or 1, generator)
+        lead = self.belief_key is not None and not isinstance(state, Tensor)
+        if start.shape[lead:] != (*batch, self.latent_dim) or action_dim != self.action_dim:
             raise ValueError(
                 f"state and actions must have shapes (*B, {self.latent_dim}) and (*B, N, H, "
-                f"{self.action_dim}), got {tuple(start.shape[drawn:])} and {tuple(actions.shape)}"
+                f"{self.action_dim}), got {tuple(start.shape[lead:])} and {tuple(actions.shape)}"
             )
         actions = actions.to(start.dtype)
-        transition = self.world_model.transition
-        if not drawn and num_samples is not None:
-            start = start.expand(num_samples, *start.shape)
-        start = start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim)
-        if num_samples is None:
-            return rollout(transition, start, actions, self.how), actions
-        actions = actions.expand(num_samples, *actions.shape)
-        if drawn and self.how != "sample":  # the belief is sampled, what follows is not
-            return rollout(transition, start, actions, self.how), actions
-        return rollout(CommonNoise(transition, generator), start, actions, "mean"), actions
+        if num_samples is not None:
+            actions = actions.expand(num_samples, *actions.shape)
+            start = start if lead else start.expand(num_samples, *start.shape)
+        return start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim), actions
+
+    def _following(
+        self, state: Tensor | TensorDictBase, settings: Sampling
+    ) -> Literal["mean", "mode", "sample"]:
+        """How the next latent is chosen: what starts from a belief may be sampled at its start alone."""
+        from_belief = self.belief_key is not None and not isinstance(state, Tensor)
+        return self.how if settings.num_samples is None or from_belief else "sample"
+
+    def _tasks(self, state: Tensor | TensorDictBase, actions: Tensor) -> Tasks | None:
+        """Tasks of every step, ``(*B, 1, H or 1, *task)``: they broadcast against ``(M, *B, N, H)``."""
+        if isinstance(state, Tensor) or not self.task_keys:
+            return None
+        batch_ndim = len(state.batch_size)
+        tasks = self.world_model.prior.along(state.get("tasks"), batch_ndim, actions.shape[-2])
+        return {key: task.unsqueeze(batch_ndim) for key, task in tasks.items()}
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
         """Never: an imagined end must not trigger a reset.
-
         Args:
             tensordict: not looked at.
-
         Returns:
             ``False``.
         """
@@ -380,6 +454,10 @@ class LatentEnv(ModelBasedEnvBase):
             The input.
         """
         return tensordict
+
+    @property
+    def _observation_keys_step_mdp(self) -> list[NestedKey]:  # no specification knows the shapes of tasks
+        return [*super()._observation_keys_step_mdp, *self.task_keys]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self.world_model.step(tensordict, self.rng)
@@ -404,15 +482,6 @@ class LatentEnv(ModelBasedEnvBase):
     def __setstate__(self, state: dict[str, Any]) -> None:
         rng = state["rng"]
         super().__setstate__({**state, "rng": None if rng is None else unpack_generator(rng)})
-
-
-def _drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:
-    """Particles ``(M, *B, D)`` of a belief, by one random number for all rows, as all planning noise."""
-    index = resampling_index(
-        belief.get("log_weights"), num_samples, shared=True, generator=generator
-    ).unsqueeze(-1)
-    particles = belief.get("particles")
-    return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
 
 
 def _first(*values: Any) -> Any:

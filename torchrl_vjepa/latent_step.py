@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 from torchrl_vjepa.belief import Transition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.distributions import point_estimate
+from torchrl_vjepa.priors import Prior, Task
 
 __all__ = ["LatentStep"]
 
@@ -25,16 +26,17 @@ class LatentStep(TensorDictModuleBase):
         predictor: owns the parameters of ``transition``.
         transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
         reward_model: reads next latent and action, writes the reward; or ``None``.
-        cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``, where there is no reward model.
+        cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; or ``None``.
         how: which latent of the distribution comes next.
         action_shape: shape of one action.
         latent_key: where the latent is.
         action_key: where the action is.
         reward_key: where the reward is written.
+        prior: its energy of the next latent is a cost; its tasks are read from the input.
 
     Raises:
-        TypeError: if the reward model is no TensorDictModule.
-        KeyError: if it reads or writes other keys.
+        TypeError: if the reward model is no TensorDictModule or the prior no Prior.
+        KeyError: if the reward model reads or writes other keys.
 
     Examples:
         >>> import torch
@@ -63,12 +65,19 @@ class LatentStep(TensorDictModuleBase):
         latent_key: NestedKey,
         action_key: NestedKey,
         reward_key: NestedKey,
+        prior: Prior | None = None,
     ) -> None:
         super().__init__()
         self.predictor = predictor  # registered: its parameters move and synchronise with the env
         self.transition = transition
         self.reward_model: Any = reward_model
         self.cost = cost
+        if prior is not None and not isinstance(prior, Prior):
+            raise TypeError(
+                "prior must be a Prior, for instance EnergyPrior(energy) of a plain function, got "
+                f"{type(prior).__name__}"
+            )
+        self.prior = prior
         self.how = how
         self.action_shape = tuple(action_shape)
         self.action_dim = math.prod(action_shape)
@@ -123,32 +132,64 @@ class LatentStep(TensorDictModuleBase):
         action = action.reshape((*latent.shape[:-1], self.action_dim)).to(latent.dtype)
         p = self.transition(latent, action)
         latent = point_estimate(p, self.how, generator=generator)
-        reward = -self.stage_cost(latent, action).unsqueeze(-1)
         out = TensorDict({}, batch_size=tensordict.batch_size, device=tensordict.device)
+        task: Task = None
+        if self.prior is not None:
+            ndim = tensordict.batch_dims
+            task = {k: v.squeeze(ndim) for k, v in self.prior.along(tensordict, ndim, 1).items()}
+            out.update(self.prior.advanced(tensordict, ndim))
+        reward = -self.stage_cost(latent, action, task).unsqueeze(-1)
         return out.set(self.latent_key, latent).set(self.reward_key, reward)
 
-    def stage_cost(self, latent: Tensor, action: Tensor) -> Tensor:
+    def stage_cost(self, latent: Tensor, action: Tensor, task: Task = None) -> Tensor:
         """Costs of next latents and the actions that led there, all at once.
+
+        Args:
+            latent: of shape ``(*B, D)``.
+            action: flat, of shape ``(*B, A)``.
+            task: of the prior, with batch dimensions that broadcast against ``*B``.
+
+        Returns:
+            Of shape ``(*B)``: the cost, minus the reward, plus the energy of the prior.
+
+        Raises:
+            ValueError: if one of them returns another shape.
+        """
+        total = self.own_cost(latent, action)
+        if self.prior is None:
+            return total
+        energy = _checked_shape(self.prior.energy(latent, task), latent.shape[:-1], "prior")
+        return energy if total is None else total + energy
+
+    def own_cost(self, latent: Tensor, action: Tensor) -> Any:
+        """The cost without the energy of the prior.
 
         Args:
             latent: of shape ``(*B, D)``.
             action: flat, of shape ``(*B, A)``.
 
         Returns:
-            Of shape ``(*B)``.
+            Of shape ``(*B)``; ``None`` where there is only a prior.
 
         Raises:
             ValueError: if the cost or the reward model returns another shape.
         """
+        total = None
         if self.cost is not None:
-            return _checked_shape(self.cost(latent, action), latent.shape[:-1], "cost")
+            total = _checked_shape(self.cost(latent, action), latent.shape[:-1], "cost")
+        if self.reward_model is None:
+            return total
+        reward = self._reward(latent, action)
+        return -reward if total is None else total - reward
+
+    def _reward(self, latent: Tensor, action: Tensor) -> Tensor:
         batch = latent.shape[:-1]
         shaped = action.reshape((*batch, *self.action_shape))
         if self.reward_calls_tensors:
             reward = self._reward_of_tensors(latent, shaped)
         else:
             reward = self._reward_of_tensordict(latent, shaped)
-        return -_checked_shape(reward, (*batch, 1), "reward_model").squeeze(-1)
+        return _checked_shape(reward, (*batch, 1), "reward_model").squeeze(-1)
 
     def probe(
         self, latent_dim: int, action_dim: int, device: torch.device | None, dtype: torch.dtype
@@ -194,8 +235,11 @@ class LatentStep(TensorDictModuleBase):
                 f"{tuple(latent.shape[-1:])} for latent {tuple(latent.shape)} and action "
                 f"{tuple(action.shape)}, got {tuple(p.batch_shape)} and {tuple(p.event_shape)}"
             )
-        first = self.stage_cost(latent, action)
+        if self.prior is not None and not self.prior.in_keys:  # else there is no task to try it with
+            self.stage_cost(latent, action)
+        self.own_cost(latent, action)
         model = self.reward_model
+        first = torch.empty(0) if model is None else self._reward(latent, action)
         if (
             type(model) is TensorDictModule
             and isinstance(model.module, nn.Module)
@@ -204,7 +248,7 @@ class LatentStep(TensorDictModuleBase):
             # A plain network needs no tensordict per call, provided that it says the same.
             try:
                 second = self._reward_of_tensors(latent, action.reshape((*batch, *self.action_shape)))
-                self.reward_calls_tensors = torch.equal(second.squeeze(-1), -first)
+                self.reward_calls_tensors = torch.equal(second.squeeze(-1), first)
             except (TypeError, RuntimeError, ValueError):  # keyword inputs, for instance
                 self.reward_calls_tensors = False
 

@@ -40,6 +40,7 @@ __all__ = [
     "cvar",
     "entropic",
     "expectation",
+    "free_energy",
     "mean_variance",
     "plan_cost",
     "worst_case",
@@ -215,6 +216,30 @@ def _entropic(costs: Tensor, risk_aversion: float) -> Tensor:
     return largest + torch.where(near > -0.5, small, large) / risk_aversion
 
 
+def free_energy(costs: Tensor) -> Tensor:
+    r"""Free energy, :math:`-\log \frac1M \sum_m e^{-J^{(m)}}`: minus the log-probability of success.
+
+    Where a trajectory succeeds with probability :math:`e^{-J}`, as under a prior of energy :math:`J`, this
+    is minus the log-probability that the plan does: control as inference. It is at most the mean, because
+    it counts on the noise to help: :func:`entropic` with an aversion of minus one.
+
+    Args:
+        costs: of shape ``(M, *B)``, samples first, in nats.
+
+    Returns:
+        Of shape ``(*B)``.
+
+    Raises:
+        ValueError: if there is no sample.
+
+    Examples:
+        >>> import torch
+        >>> free_energy(torch.tensor([[0.0], [100.0]]))  # one of two succeeds
+        tensor([0.6931])
+    """
+    return math.log(_checked(costs).shape[0]) - torch.logsumexp(-costs, dim=0)
+
+
 class ChanceConstraint(nn.Module):
     r"""A bound on the probability of a violation along the predicted belief.
 
@@ -341,6 +366,7 @@ class Sampling(NamedTuple):
         num_samples: trajectories ``M`` per plan; ``None``: the point prediction.
         risk: of their summed costs.
         constraints: on their latents and actions.
+        fusion: how a prior enters.
 
     Examples:
         >>> Sampling.checked(64, cvar(0.1), ()).num_samples
@@ -350,10 +376,15 @@ class Sampling(NamedTuple):
     num_samples: int | None
     risk: Risk
     constraints: tuple[ChanceConstraint, ...]
+    fusion: str = "energy"
 
     @classmethod
     def checked(
-        cls, num_samples: int | None, risk: Risk | None, constraints: Sequence[ChanceConstraint]
+        cls,
+        num_samples: int | None,
+        risk: Risk | None,
+        constraints: Sequence[ChanceConstraint],
+        fusion: str = "energy",
     ) -> Sampling:
         """Refuse what cannot be evaluated.
 
@@ -361,18 +392,31 @@ class Sampling(NamedTuple):
             num_samples: trajectories per plan; ``None``: the point prediction.
             risk: ``None``: the expectation.
             constraints: any number of them.
+            fusion: how a prior enters; by posterior the risk is :func:`free_energy`.
 
         Returns:
             The same as a tuple.
 
         Raises:
-            ValueError: if ``num_samples`` is not positive, or a risk or constraint has no samples to read.
+            ValueError: if ``num_samples`` is not positive, a risk or constraint has no samples to read, or
+                planning by posterior has none, or another risk.
             TypeError: if ``risk`` is not callable or ``constraints`` holds something else.
         """
         if num_samples is not None and (
             isinstance(num_samples, bool) or not isinstance(num_samples, int) or num_samples < 1
         ):
             raise ValueError(f"num_samples must be an integer of at least 1, got {num_samples!r}")
+        if fusion not in ("energy", "weight", "propose"):
+            raise ValueError(f"fusion must be 'energy', 'weight' or 'propose', got {fusion!r}")
+        if fusion != "energy":
+            if num_samples is None or num_samples < 2:
+                raise ValueError(
+                    f"num_samples must be at least 2 for fusion={fusion!r}, which reads trajectories, got "
+                    f"{num_samples}; give it to the planner or, with how='sample', to LatentEnv"
+                )
+            if risk not in (None, free_energy):
+                raise ValueError(f"risk must be None for fusion={fusion!r}, itself one, got {risk!r}")
+            risk = free_energy
         if risk is not None and not callable(risk):
             raise TypeError(f"risk must be callable, (costs (M, *B)) -> (*B), got {type(risk).__name__}")
         if isinstance(constraints, ChanceConstraint) or not all(
@@ -390,7 +434,7 @@ class Sampling(NamedTuple):
                 "num_samples must be at least 2 for a risk or a constraint, which read a distribution of "
                 "trajectories, got 1"
             )
-        return cls(num_samples, expectation if risk is None else risk, tuple(constraints))
+        return cls(num_samples, expectation if risk is None else risk, tuple(constraints), fusion)
 
 
 def plan_cost(

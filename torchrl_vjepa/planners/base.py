@@ -6,7 +6,7 @@ import abc
 import math
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -89,6 +89,9 @@ class Planner(MPCPlannerBase):
             :func:`~torchrl_vjepa.risk.cvar`; the environment's by default.
         constraints: chance constraints on them (:class:`~torchrl_vjepa.risk.ChanceConstraint`); the
             environment's by default.
+        fusion: how the environment's prior enters the cost of a plan: as an ``"energy"``, or by posterior
+            (``"weight"``, ``"propose"``; see :class:`~torchrl_vjepa.envs.LatentEnv`); the environment's by
+            default.
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
             (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
             there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
@@ -149,6 +152,7 @@ class Planner(MPCPlannerBase):
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
+        fusion: Literal["energy", "weight", "propose"] | None = None,
         return_stats: bool = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
@@ -170,9 +174,9 @@ class Planner(MPCPlannerBase):
         # Looked up on the class: a transform around a LatentEnv must be stepped, not bypassed.
         offers_objective = callable(getattr(type(env), "objective", None))
         self._env_objective = None if offers_objective else EnvObjective(env)
-        asked = {"num_samples": num_samples, "risk": risk, "constraints": constraints}
+        asked = {"num_samples": num_samples, "risk": risk, "constraints": constraints, "fusion": fusion}
         self._constrained = self._checked_sampling(_given(asked))
-        self.num_samples, self.risk = num_samples, risk
+        self.num_samples, self.risk, self.fusion = num_samples, risk, fusion
         self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
         self.warm_start, self.warm_std, self.return_stats = warm_start, warm_std, return_stats
@@ -354,7 +358,8 @@ class Planner(MPCPlannerBase):
         return statistics
 
     def _evaluate(self, state: Any, candidates: Tensor) -> Tensor:
-        asked = _given({"num_samples": self.num_samples, "risk": self.risk, "constraints": self.constraints})
+        names = "num_samples", "risk", "constraints", "fusion"
+        asked = _given({name: getattr(self, name) for name in names})
         generator = self._model_generator
         costs = self._source.objective(state, candidates, generator=generator, **asked)
         costs = costs.to(candidates.dtype)

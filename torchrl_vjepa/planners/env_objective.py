@@ -108,6 +108,7 @@ class EnvObjective:
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
+        fusion: str | None = None,
     ) -> Sampling:
         """How plans are evaluated where this is asked for.
 
@@ -115,14 +116,19 @@ class EnvObjective:
             num_samples: trajectories per plan; ``None``: one, whose cost is taken as it is.
             risk: of their costs; ``None``: the expectation.
             constraints: none is supported.
+            fusion: none is supported.
 
         Returns:
             The settings together.
 
         Raises:
             ValueError: if ``num_samples`` is not positive, or a risk has no samples to read.
-            TypeError: if ``risk`` is not callable, or constraints are given.
+            TypeError: if ``risk`` is not callable, or constraints or a fusion are given.
         """
+        if fusion is not None:
+            raise TypeError(
+                f"fusion needs an environment with a prior, as LatentEnv, got {type(self.env).__name__}"
+            )
         if constraints:
             raise TypeError(
                 "constraints need an environment with latents, as LatentEnv, got "
@@ -157,7 +163,8 @@ class EnvObjective:
             ValueError: if ``num_samples`` is not positive, or a risk has no samples to read.
             TypeError: if ``risk`` is not callable, or constraints are given.
         """
-        num_samples, risk, _ = self.sampling(num_samples, risk, constraints)
+        settings = self.sampling(num_samples, risk, constraints)
+        num_samples, risk = settings.num_samples, settings.risk
         state = state.unsqueeze(-1).expand(actions.shape[:-2])
         if num_samples is None:
             return self._stepped(state, actions)

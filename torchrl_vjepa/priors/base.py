@@ -6,6 +6,7 @@ import abc
 from collections.abc import Mapping
 from typing import TypeAlias
 
+import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 from torch.distributions import Distribution
@@ -151,6 +152,25 @@ class Prior(nn.Module, abc.ABC):
                 f"{value.shape[batch_ndim]} in shape {tuple(value.shape)}"
             )
         return {self.task_key: value.narrow(batch_ndim, 0, horizon)}
+
+    def advanced(
+        self, tasks: Mapping[NestedKey, Tensor] | TensorDictBase, batch_ndim: int
+    ) -> dict[NestedKey, Tensor]:
+        r"""The entries of ``in_keys`` that are others one step later: time-indexed tasks, shifted.
+
+        Args:
+            tasks: holds the entries of ``in_keys``, with batch ``*B``.
+            batch_ndim: how many dimensions ``*B`` has.
+
+        Returns:
+            The entries that change; the last task of a sequence is repeated.
+        """
+        value = None if self.task_key is None else tasks.get(self.task_key, None)
+        if value is None or value.ndim == batch_ndim + self.task_ndim:
+            return {}
+        steps = value.shape[batch_ndim]
+        parts = value.narrow(batch_ndim, 1, steps - 1), value.narrow(batch_ndim, steps - 1, 1)
+        return {self.task_key: torch.cat(parts, dim=batch_ndim)}
 
     def bind(self, task: Task) -> BoundPrior:
         """The same prior with its task inside: a prior that takes none.

@@ -109,6 +109,20 @@ class ProbedPrior(Prior):
         """
         return self.prior.along(tasks, batch_ndim, horizon)
 
+    def advanced(
+        self, tasks: Mapping[NestedKey, Tensor] | TensorDictBase, batch_ndim: int
+    ) -> dict[NestedKey, Tensor]:
+        """See :meth:`Prior.advanced`: that of the prior.
+
+        Args:
+            tasks: holds the entries of ``in_keys``, with batch ``*B``.
+            batch_ndim: how many dimensions ``*B`` has.
+
+        Returns:
+            The entries that change.
+        """
+        return self.prior.advanced(tasks, batch_ndim)
+
     def forward(self, task: Task = None) -> LatentDensity:
         """The density over latents.
 

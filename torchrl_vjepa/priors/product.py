@@ -130,6 +130,23 @@ class ProductPrior(Prior):
                 merged[key] = value
         return merged
 
+    def advanced(
+        self, tasks: Mapping[NestedKey, Tensor] | TensorDictBase, batch_ndim: int
+    ) -> dict[NestedKey, Tensor]:
+        """What changes for any expert one step later.
+
+        Args:
+            tasks: holds the entries of ``in_keys``, with batch ``*B``.
+            batch_ndim: how many dimensions ``*B`` has.
+
+        Returns:
+            The entries that change.
+        """
+        merged: dict[NestedKey, Tensor] = {}
+        for prior, _ in self._active():
+            merged.update(prior.advanced(tasks, batch_ndim))
+        return merged
+
     def forward(self, task: Task = None) -> LatentDensity:
         """The product.
 
@@ -176,7 +193,7 @@ def _product(densities: list[tuple[LatentDensity, float]]) -> LatentDensity:
         # The power of a mixture is none, and two of them multiply to K^2 components.
         exact = weight == 1.0 and len(mixtures) == 1 and not isinstance(base, GaussianFactor)
         if exact and isinstance(mixture, Mixture) and _power(mixture.components, 1.0) is not None:
-            base = mixture if base is None else product_of_experts(mixture, base)  # type: ignore[arg-type]
+            base = mixture if base is None else product_of_experts(mixture, base)
         else:
             energies.append((_Negative(mixture), weight))
     if not energies:

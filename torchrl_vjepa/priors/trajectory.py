@@ -110,6 +110,23 @@ class TimeIndexedPrior(Prior):
             return {key: time}
         return {key: time + torch.arange(1, horizon + 1, device=time.device).unsqueeze(-1)}
 
+    def advanced(
+        self, tasks: Mapping[NestedKey, Tensor] | TensorDictBase, batch_ndim: int
+    ) -> dict[NestedKey, Tensor]:
+        """The time one step later.
+
+        Args:
+            tasks: holds the time, ``(*B, 1)`` or ``(*B, H, 1)``.
+            batch_ndim: how many dimensions ``*B`` has.
+
+        Returns:
+            The entry, one larger, or shifted.
+        """
+        time = None if self.task_key is None else tasks.get(self.task_key, None)
+        if self.task_key is None or time is None or time.ndim != batch_ndim + 1:
+            return super().advanced(tasks, batch_ndim)
+        return {self.task_key: time + 1}
+
 
 def trajectory_prior(
     path: Tensor,

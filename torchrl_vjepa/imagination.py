@@ -1,0 +1,149 @@
+"""Trajectories of candidate plans: where they start, and how the next latent is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torchrl_vjepa.belief import Transition, resampling_index, rollout
+from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
+from torchrl_vjepa.fusion import fuse
+from torchrl_vjepa.priors import LatentDensity, Prior
+
+__all__ = ["Tasks", "densities", "drawn", "imagine", "imagine_fused"]
+
+Tasks = Mapping[NestedKey, Tensor]
+
+
+def densities(prior: Prior, tasks: Tasks | None, time_dim: int) -> Callable[[int], LatentDensity]:
+    """The density of a prior at each step of a plan.
+
+    Args:
+        prior: the prior.
+        tasks: what it reads, with a time dimension of size ``H`` or 1; ``None`` if it reads nothing.
+        time_dim: which dimension that is.
+
+    Returns:
+        Step ``k`` -> density.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa import GoalPrior
+        >>> path = {"goal": torch.arange(3.0).reshape(1, 3, 1)}  # (*B, H, D)
+        >>> densities(GoalPrior(std=1.0), path, time_dim=1)(2).mean
+        tensor([[2.]])
+    """
+    if tasks is None:
+        same = prior(None)
+        return lambda k: same
+
+    def at(k: int) -> LatentDensity:
+        steps = {key: (value, min(k, value.shape[time_dim] - 1)) for key, value in tasks.items()}
+        return prior({key: value.select(time_dim, index) for key, (value, index) in steps.items()})
+
+    return at
+
+
+def drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:
+    """Particles of a belief, by one random number for all rows, as all planning noise.
+
+    Args:
+        belief: with ``particles (*B, K, D)`` and ``log_weights (*B, K)``.
+        num_samples: how many, ``M``.
+        generator: source of randomness.
+
+    Returns:
+        Of shape ``(M, *B, D)``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> belief = TensorDict(particles=torch.zeros(5, 2), log_weights=torch.zeros(5))
+        >>> drawn(belief, 3, None).shape
+        torch.Size([3, 2])
+    """
+    index = resampling_index(
+        belief.get("log_weights"), num_samples, shared=True, generator=generator
+    ).unsqueeze(-1)
+    particles = belief.get("particles")
+    return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
+
+
+def imagine(
+    transition: Transition,
+    start: Tensor,
+    actions: Tensor,
+    how: Literal["mean", "mode", "sample"],
+    generator: torch.Generator | None,
+) -> Tensor:
+    r"""Next latents :math:`Z_{t+1}, \dots, Z_{t+H}` of candidate plans.
+
+    Args:
+        transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
+        start: of shape ``(*B, N, D)``, or ``(M, *B, N, D)`` for ``how="sample"``.
+        actions: of shape ``(*B, N, H, A)``, or with ``M`` in front.
+        how: the next latent; samples share their noise across all but the first dimension.
+        generator: source of randomness for samples.
+
+    Returns:
+        Of the shape of ``actions``, with ``D`` for ``A``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> move = lambda latent, action: Delta(latent + action)
+        >>> imagine(move, torch.zeros(1, 1), torch.ones(1, 3, 1), "mean", None).flatten()
+        tensor([1., 2., 3.])
+    """
+    if how == "sample":
+        return rollout(CommonNoise(transition, generator), start, actions, "mean")
+    return rollout(transition, start, actions, how)
+
+
+def imagine_fused(
+    transition: Transition,
+    start: Tensor,
+    actions: Tensor,
+    prior_at: Callable[[int], LatentDensity],
+    generator: torch.Generator | None,
+) -> tuple[Tensor, Tensor]:
+    r"""Trajectories drawn from the fused transition, and what corrects for it.
+
+    :math:`Z_{t+k+1} \sim p(\cdot \mid Z_{t+k}, u_{t+k}, \eta_{t+k+1})` (``eq:bjepa_filter``). The
+    normalisers :math:`c_k = \int p_{\text{like}}(Z \mid Z_{t+k}, u_{t+k})\, p_{\text{prior}}(Z \mid
+    \eta_{t+k+1})\, dZ` say how far the prior had to pull: their product has the same mean over
+    trajectories as :math:`\prod_k p_{\text{prior}}(Z_{t+k+1})` has over those of :math:`p_{\text{like}}`.
+
+    Args:
+        transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
+        start: of shape ``(M, *B, N, D)``.
+        actions: of shape ``(M, *B, N, H, A)``.
+        prior_at: step ``k`` -> the density of the next latent, batch broadcasting against ``(M, *B, N)``.
+        generator: source of randomness; trajectories share their noise across all but the first dimension.
+
+    Returns:
+        Next latents ``(M, *B, N, H, D)``, and :math:`\log c_k` of shape ``(M, *B, N, H)``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa.distributions import diag_gaussian
+        >>> walk = lambda latent, action: diag_gaussian(latent + action, torch.ones(1))
+        >>> goal = diag_gaussian(torch.zeros(1), torch.ones(1))
+        >>> latents, evidence = imagine_fused(
+        ...     walk, torch.zeros(64, 2, 1), torch.zeros(64, 2, 3, 1), lambda k: goal, None
+        ... )
+        >>> latents.shape, evidence.shape
+        (torch.Size([64, 2, 3, 1]), torch.Size([64, 2, 3]))
+    """
+    latent = start
+    latents, evidence = [], []
+    for k, action in enumerate(actions.unbind(-2)):
+        fusion = fuse(transition(latent, action), prior_at(k), generator=generator, shared_noise=True)
+        latent = sample_common(fusion.posterior, generator=generator)
+        latents.append(latent)
+        evidence.append(fusion.log_evidence.expand(latent.shape[:-1]))
+    return torch.stack(latents, dim=-2), torch.stack(evidence, dim=-1)
