@@ -153,6 +153,14 @@ class TestOracles:
         plan = planner.plan(latent, Proposal(start, torch.ones_like(start)))
         assert torch.equal(plan.actions, u)
 
+    def test_projection_by_hand(self) -> None:
+        """Each step starts on the bound onto which the one before was put: 0, 0.54 -> 0.5, 0.5 - 0.36."""
+        env = reach_env(quadratic_cost(torch.full((1,), 0.3)), Bounded(-0.5, 0.5, (1,)))
+        optimizer = functools.partial(torch.optim.SGD, lr=0.9)
+        planner = GradientMPC(env, 1, 2, optimizer=optimizer, num_starts=1, init_std=2.0, seed=0)
+        action = planner(TensorDict(latent=torch.zeros(1)))["action"]
+        torch.testing.assert_close(action, torch.tensor([0.14]))
+
     def test_the_gradient_of_sampled_trajectories(self) -> None:
         """E (Z - 1)^2 with Z ~ N(u, (0.02 + u / 2)^2) is lowest at u = 1.98 / 2.5."""
 
@@ -303,7 +311,9 @@ class TestNotFinite:
         low=st.floats(-100, 100),
         width=st.floats(0.01, 100),
         bounds=st.sampled_from(BOUNDS),
-        optimizer=st.sampled_from([None, SGD, functools.partial(torch.optim.SGD, lr=0.1, momentum=0.9)]),
+        optimizer=st.sampled_from(
+            [None, SGD, functools.partial(torch.optim.SGD, lr=0.1, momentum=0.9), torch.optim.LBFGS]
+        ),
     )
     def test_actions_are_finite_and_inside_the_spec_whatever_the_cost(
         self, value: float, slope: float, low: float, width: float, bounds: Any, optimizer: Any
@@ -318,6 +328,42 @@ class TestNotFinite:
             assert actions.isfinite().all()
             assert all(spec.is_in(action) for action in actions)
 
+    @pytest.mark.parametrize("bounds", BOUNDS)
+    def test_every_plan_that_is_evaluated_is_inside(self, bounds: Any) -> None:
+        """Those between two steps of LBFGS too, of which the best may be returned."""
+        seen: list[Tensor] = []
+
+        def cost(latent: Tensor, action: Tensor) -> Tensor:
+            seen.append(action.detach())
+            return -action.sum(-1)
+
+        planner = GradientMPC(reach_env(cost), 3, 2, optimizer=torch.optim.LBFGS, bounds=bounds, seed=0)
+        seen.clear()
+        action = planner(TensorDict(latent=torch.zeros(1)))["action"]
+        assert len(seen) > 3  # two steps and the last plan
+        assert all((actions.abs() <= 2).all() for actions in seen)
+        torch.testing.assert_close(action, torch.tensor([2.0]))
+
+    def test_what_the_optimiser_is_told_is_the_sum_of_finite_costs(self) -> None:
+        told: list[float] = []
+
+        class Listen(torch.optim.SGD):
+            def step(self, closure: Any) -> None:  # type: ignore[override]
+                told.append(float(closure()))
+
+        def cost(latent: Tensor, action: Tensor) -> Tensor:
+            return torch.where(latent[..., 0] > 0, math.inf, 3.0 + 0 * action[..., 0])
+
+        def hold(latent: Tensor, action: Tensor) -> Delta:
+            return Delta(latent)
+
+        env = LatentEnv(hold, action_spec=Bounded(-1, 1, (1,)), cost=cost, latent_dim=1)
+        planner = GradientMPC(env, 1, 1, optimizer=Listen, num_starts=2, seed=0)
+        told.clear()
+        plan = planner.plan(torch.tensor([[1.0], [-1.0]]), cold(planner, 2))
+        assert told == [6.0]
+        assert plan.best_cost.tolist() == [math.inf, 3.0]
+
     @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
     def test_no_finite_cost_gives_the_centre_and_one_warning(self, bad: float) -> None:
         env = reach_env(lambda latent, action: bad + action.sum(-1), Bounded(10, 20, (2,)))
@@ -327,30 +373,43 @@ class TestNotFinite:
         torch.testing.assert_close(out["action"], torch.full((5, 2), 15.0))
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-    def test_a_bad_start_leaves_the_others_alone(self, bad: float) -> None:
+    @pytest.mark.parametrize(
+        "optimizer", [None, functools.partial(torch.optim.LBFGS, line_search_fn="strong_wolfe")]
+    )
+    def test_a_bad_start_leaves_the_others_alone(self, bad: float, optimizer: Any) -> None:
         def cost(latent: Tensor, action: Tensor) -> Tensor:
             u = action[..., 0]
             return torch.where(u > 0.1, bad, (u + 0.3).square()) * torch.where(u > 0.1, u, 1.0)
 
-        planner = GradientMPC(reach_env(cost), 1, 100, num_starts=8, warm_std=1.0, seed=0)
+        planner = GradientMPC(
+            reach_env(cost), 1, 100, num_starts=8, warm_std=1.0, optimizer=optimizer, seed=0
+        )
         td = TensorDict(latent=torch.zeros(2, 1), plan=torch.tensor([1.0, -1.0]).reshape(2, 1, 1))
         td.batch_size = [2]
         torch.testing.assert_close(planner(td)["action"], torch.full((2, 1), -0.3), atol=1e-3, rtol=0)
 
     def test_a_gradient_that_is_not_finite_is_no_gradient(self) -> None:
-        """sqrt has an infinite slope at zero: the row there stays, the other moves."""
+        """The root has no slope at zero: that action stays, the other goes to its optimum."""
 
         def cost(latent: Tensor, action: Tensor) -> Tensor:
-            return (action[..., 0] - latent[..., 0]).abs().sqrt()
+            return action[..., 0].abs().sqrt() + (action[..., 1] - 1).square()
 
-        def hold(latent: Tensor, action: Tensor) -> Delta:
-            return Delta(latent)
+        planner = GradientMPC(reach_env(cost, Bounded(-2, 2, (2,))), 1, 100, num_starts=1, seed=0)
+        action = planner(TensorDict(latent=torch.zeros(2)))["action"]
+        torch.testing.assert_close(action, torch.tensor([0.0, 1.0]), atol=1e-2, rtol=0)
 
-        env = LatentEnv(hold, action_spec=Bounded(-2, 2, (1,)), cost=cost, latent_dim=1)
-        planner = GradientMPC(env, 1, 30, optimizer=SGD, num_starts=1, seed=0)
-        plan = planner.plan(torch.tensor([[0.0], [0.5]]), cold(planner, 2))
-        assert plan.actions[0].item() == 0
-        assert 0.3 < plan.actions[1].item() < 0.7
+    def test_actions_that_are_no_numbers_cost_infinity(self) -> None:
+        """Whatever the optimiser does, and however well the cost speaks of it."""
+
+        def cost(latent: Tensor, action: Tensor) -> Tensor:
+            return torch.where(action[..., 0].isnan(), -100.0, action[..., 0].square())
+
+        planner = GradientMPC(
+            reach_env(cost, Unbounded((1,))), 1, 3, optimizer=_Poison, num_starts=1, init_std=1.0, seed=0
+        )
+        plan = planner.plan(torch.zeros(1), Proposal(torch.ones(1, 1), torch.ones(1, 1)))
+        assert plan.actions.item() == 1.0
+        assert plan.best_cost.item() == 1.0
 
     def test_unbounded_actions_that_run_away_lose(self) -> None:
         """The cost is lowest where an action is no number, and it does not look at it."""
@@ -365,13 +424,23 @@ class TestNotFinite:
         assert planner(TensorDict(latent=torch.zeros(2)))["action"].isfinite().all()
 
 
+class _Poison(torch.optim.Optimizer):
+    def __init__(self, variables: list[Tensor]) -> None:
+        super().__init__(variables, {})
+
+    def step(self, closure: Any) -> None:  # type: ignore[override]
+        closure()
+        with torch.no_grad():
+            self.param_groups[0]["params"][0].fill_(math.nan)
+
+
 class _Network(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.network = nn.Sequential(nn.Linear(4, 8), nn.Tanh(), nn.Linear(8, 2))
 
     def forward(self, latent: Tensor, action: Tensor) -> Delta:
-        return Delta(self.network(torch.cat([latent, action], dim=-1)))
+        return Delta(self.network(torch.cat([latent * action, action], dim=-1)))
 
 
 class TestModes:
@@ -430,8 +499,9 @@ class TestModes:
         assert torch.equal(starts[:, 0], cold(planner, 2).mean)
         assert len(starts[0].flatten(1).unique(dim=0)) == 5
 
-    def test_empty_batch(self) -> None:
-        _, planner = self.make()
+    @pytest.mark.parametrize("optimizer", [None, torch.optim.LBFGS])
+    def test_empty_batch(self, optimizer: Any) -> None:
+        planner = GradientMPC(linear_env(), 3, optimizer=optimizer, seed=0)
         out = planner(TensorDict(latent=states()[:0], batch_size=0))
         assert out["action"].shape == (0, 2)
 

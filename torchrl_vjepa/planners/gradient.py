@@ -201,7 +201,8 @@ class GradientMPC(Planner):
             # LBFGS's types want floats where tensors do.
             optimizer.step(closure)  # type: ignore[arg-type]
             if not squashed:
-                self._project(x)
+                with torch.no_grad():
+                    x.copy_((self.cold_std * x).clamp(*bounds) / self.cold_std)
             if self.tolerance is not None and not found.improves(self.tolerance, self.patience):
                 return found
             if self.max_ms is not None:
@@ -223,13 +224,6 @@ class GradientMPC(Planner):
         )
         drawn = torch.addcmul(mean.unsqueeze(-3), std.unsqueeze(-3), noise)
         return torch.cat([mean.unsqueeze(-3), drawn], dim=-3).clamp(self.low, self.high)
-
-    def _project(self, x: Tensor) -> None:
-        """Put variables whose action left the bounds onto the nearest bound; leave the others."""
-        with torch.no_grad():
-            actions = self.cold_std * x
-            inside = actions.clamp(self.low, self.high)
-            x.copy_(torch.where(actions == inside, x, inside / self.cold_std))
 
 
 class _Incumbent:
