@@ -25,6 +25,7 @@ from torch.distributions import (
     Uniform,
 )
 
+from torchrl_vjepa.belief import ParticleBelief
 from torchrl_vjepa.distributions import Delta, NoiseDistribution, sample
 
 __all__ = ["CommonNoise", "sample_common"]
@@ -35,10 +36,10 @@ def sample_common(p: Distribution, *, generator: torch.Generator | None = None, 
     r"""One draw per distribution, :math:`Z^{(m,i)} = T_{p_{m,i}}(\varepsilon^{(m)})`.
 
     The first batch dimension of ``p`` counts samples, which get noise of their own; the rest are rows, which
-    share it. Gaussians (diagonal, full, low-rank) and the other location-scale families, their mixtures and
-    their transformations (flows) are drawn so; what else there is, independently. Two equal distributions
-    give equal draws, and draws move with the parameters. Of a mixture, a common uniform number picks the
-    component, in the order in which the components are kept.
+    share it. Gaussians (diagonal, full, low-rank) and the other location-scale families, their mixtures,
+    their transformations (flows) and particles are drawn so; what else there is, independently. Two equal
+    distributions give equal draws, and draws move with the parameters. Of a mixture, a common uniform number
+    picks the component, in the order in which the components are kept; of particles, the particle.
 
     Gradients flow to the parameters; for a mixture to those of the component that was picked, not to the
     weights. A family of one's own joins by ``@sample_common.register``.
@@ -138,6 +139,14 @@ def _(p: MixtureSameFamily, *, generator: torch.Generator | None = None, own_dim
     index = index.reshape(*index.shape, 1, *[1] * len(p.event_shape))
     index = index.expand(*p.batch_shape, 1, *p.event_shape)
     return parts.gather(len(p.batch_shape), index).squeeze(len(p.batch_shape))
+
+
+@sample_common.register
+def _(p: ParticleBelief, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
+    # Particles are taken in their order, which means the same in all rows if their noise was shared.
+    u = _uniform((*_noise_shape(p.batch_shape, own_dims), 1), p.particles, generator)
+    index = (u >= p.weights.cumsum(-1)[..., :-1]).sum(-1)[..., None, None].expand(*p.batch_shape, 1, 1)
+    return torch.take_along_dim(p.particles, index, -2).squeeze(-2)
 
 
 @sample_common.register
