@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,3 +53,15 @@ def pairs_that_count(
             good = good and bool(mask[s])
         count.append(good)
     return count
+
+
+INTEGRATION_GRID = torch.linspace(-12.0, 12.0, 24001, dtype=torch.float64)
+
+
+def product_integrals(p: Any, prior: Any) -> tuple[float, float, float]:
+    """Log of the integral of p times prior, and mean and variance of the product, in one dimension."""
+    z = INTEGRATION_GRID.unsqueeze(-1)
+    mass = (p.log_prob(z) + prior.log_prob(z)).exp() * (INTEGRATION_GRID[1] - INTEGRATION_GRID[0])
+    mean = (mass * INTEGRATION_GRID).sum() / mass.sum()
+    variance = (mass * (INTEGRATION_GRID - mean) ** 2).sum() / mass.sum()
+    return float(mass.sum().log()), float(mean), float(variance)

@@ -23,6 +23,7 @@ from torch.distributions import (
 )
 from torch.distributions.transforms import AffineTransform, TanhTransform
 
+from torchrl_vjepa.belief import ParticleBelief
 from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
 from torchrl_vjepa.distributions import Delta, diag_gaussian
 
@@ -61,6 +62,13 @@ def factor_flow(loc: Tensor) -> Distribution:
     return TransformedDistribution(Normal(loc, 0.5), [AffineTransform(1.0, 2.0, event_dim=1)])
 
 
+def particles(loc: Tensor) -> Distribution:
+    random = torch.Generator().manual_seed(3)
+    offsets = torch.randn(500, 2, dtype=torch.float64, generator=random)
+    weights = torch.rand(500, dtype=torch.float64, generator=random).log().expand(*loc.shape[:-1], 500)
+    return ParticleBelief(loc.unsqueeze(-2) + offsets, weights)
+
+
 FAMILIES: dict[str, Callable[[Tensor], Distribution]] = {
     "diagonal": lambda loc: diag_gaussian(loc, torch.full_like(loc, 0.5)),
     "full": full,
@@ -69,6 +77,7 @@ FAMILIES: dict[str, Callable[[Tensor], Distribution]] = {
     "full_mixture": full_mixture,
     "flow": flow,
     "factor_flow": factor_flow,
+    "particles": particles,
     "laplace": lambda loc: Independent(Laplace(loc, 0.5, validate_args=False), 1),
     "uniform": lambda loc: Independent(Uniform(loc - 1, loc + 1, validate_args=False), 1),
     "cauchy": lambda loc: Independent(Cauchy(loc, 0.5, validate_args=False), 1),

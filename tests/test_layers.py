@@ -59,6 +59,7 @@ SIDEWAYS = {
     ("baselines", "models"),
     ("baselines", "objectives"),
     ("predictor", "fusion"),
+    ("common_random_numbers", "belief"),
     ("diagnostics", "models"),
     ("objectives", "models"),
     ("envs", "imagination"),

@@ -39,7 +39,7 @@ def sample_common(p: Distribution, *, generator: torch.Generator | None = None, 
     share it. Gaussians (diagonal, full, low-rank) and the other location-scale families, their mixtures,
     their transformations (flows) and particles are drawn so; what else there is, independently. Two equal
     distributions give equal draws, and draws move with the parameters. Of a mixture, a common uniform number
-    picks the component, in the order in which the components are kept.
+    picks the component, in the order in which the components are kept; of particles, the particle.
 
     Gradients flow to the parameters; for a mixture to those of the component that was picked, not to the
     weights. A family of one's own joins by ``@sample_common.register``.
@@ -143,10 +143,10 @@ def _(p: MixtureSameFamily, *, generator: torch.Generator | None = None, own_dim
 
 @sample_common.register
 def _(p: ParticleBelief, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
-    weights = p.weights
-    u = _uniform((*_noise_shape(p.batch_shape, own_dims), 1), weights, generator)
-    index = (u >= weights.cumsum(dim=-1)[..., :-1]).sum(dim=-1)[..., None, None]
-    return p.particles.gather(-2, index.expand(*index.shape[:-1], *p.event_shape)).squeeze(-2)
+    # Particles are taken in their order, which means the same in all rows if their noise was shared.
+    u = _uniform((*_noise_shape(p.batch_shape, own_dims), 1), p.particles, generator)
+    index = (u >= p.weights.cumsum(-1)[..., :-1]).sum(-1)[..., None, None].expand(*p.batch_shape, 1, 1)
+    return torch.take_along_dim(p.particles, index, -2).squeeze(-2)
 
 
 @sample_common.register

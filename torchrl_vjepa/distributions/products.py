@@ -17,6 +17,7 @@ from torch.distributions import (
 from torchrl_vjepa.distributions.densities import GaussianFactor
 from torchrl_vjepa.distributions.gaussians import DiagGaussian, LowRankGaussian, diag_gaussian, full_gaussian
 from torchrl_vjepa.distributions.mixtures import Mixture
+from torchrl_vjepa.distributions.moments import moments
 from torchrl_vjepa.distributions.noise import full_precision
 
 __all__ = ["has_closed_form", "product_of_experts"]
@@ -126,12 +127,12 @@ def _loc_scale(p: Distribution) -> tuple[Tensor, Tensor]:
     return (p.loc, p.scale) if isinstance(p, DiagGaussian) else (p.mean, p.stddev)
 
 
-def _diagonal_product(moments: list[tuple[Tensor, Tensor]]) -> Distribution:
+def _diagonal_product(experts: list[tuple[Tensor, Tensor]]) -> Distribution:
     # In units of the sharpest expert: no precision overflows. The unit cancels, so it needs no gradient.
-    unit = functools.reduce(torch.minimum, [scale for _, scale in moments]).detach()
-    weights = [(unit / scale).square() for _, scale in moments]
+    unit = functools.reduce(torch.minimum, [scale for _, scale in experts]).detach()
+    weights = [(unit / scale).square() for _, scale in experts]
     total = functools.reduce(torch.add, weights)
-    weighted = functools.reduce(torch.add, [w * loc for w, (loc, _) in zip(weights, moments, strict=True)])
+    weighted = functools.reduce(torch.add, [w * loc for w, (loc, _) in zip(weights, experts, strict=True)])
     return diag_gaussian(weighted / total, unit * total.rsqrt())
 
 
@@ -150,7 +151,7 @@ def _information_form(p: Expert) -> tuple[Tensor, Tensor]:
 def _full(p: Distribution) -> MultivariateNormal:
     if isinstance(p, MultivariateNormal):
         return p
-    return full_gaussian(p.mean, torch.linalg.cholesky(p.covariance_matrix))
+    return full_gaussian(p.mean, torch.linalg.cholesky(moments(p)[1]))
 
 
 def _scale_of(precision: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -72,7 +72,7 @@ class FusedPredictor(PredictiveModel):
         super().__init__()
         if num_particles < 1:
             raise ValueError(f"num_particles must be at least 1, got {num_particles}")
-        if not (prior is None or callable(prior) or isinstance(prior, get_args(LatentDensity))):
+        if not (prior is None or callable(prior) or isinstance(prior, LatentDensity)):
             raise TypeError(
                 "prior must be a Prior, a density over latents, a callable that returns one, or None, got "
                 f"{type(prior).__name__}"
@@ -197,7 +197,7 @@ class FusedPredictor(PredictiveModel):
             )
         if self.prior is None:
             return Density()
-        return self.prior if isinstance(self.prior, get_args(LatentDensity)) else self.prior()
+        return self.prior if isinstance(self.prior, LatentDensity) else self.prior()
 
     def __getstate__(self) -> dict[str, Any]:
         generator = None if self.generator is None else pack_generator(self.generator)
