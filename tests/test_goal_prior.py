@@ -107,7 +107,7 @@ def test_a_mapper_learns_by_maximum_likelihood(spread: bool) -> None:
 def test_the_target_encoder_of_a_loss(several: bool) -> None:
     """The averaged parameters, of the model that is asked for; later updates do not reach it."""
     models = [VJEPA(linear_encoder(OBS, D), Predictor(D)) for _ in range(2 if several else 1)]
-    loss = VJEPALoss(models if several else models[0])
+    loss = VJEPALoss(models if several else models[0], collapse_rank=0.0)
     updater = SoftUpdate(loss, eps=0.5)
     start = [copy.deepcopy(model.encoder.module.network.weight.detach()) for model in models]
     index = len(models) - 1

@@ -125,6 +125,14 @@ def test_closed_forms_are_kept() -> None:
     assert isinstance(mixed.base, Independent)
 
 
+def test_factors_keep_their_constants() -> None:
+    generator = torch.Generator().manual_seed(0)
+    first, second = density("factor", generator), density("factor", generator)
+    z = torch.randn(5, D, generator=generator, dtype=DTYPE)
+    got = ProductPrior(Given(first), Given(second), weights=(2, 1)).log_prob(z)
+    torch.testing.assert_close(got, 2 * first.log_prob(z) + second.log_prob(z))
+
+
 def test_one_expert_is_itself_and_none_is_flat() -> None:
     prior = GaussianPrior(D)
     latent = torch.randn(4, D)

@@ -437,8 +437,10 @@ class LatentEnv(ModelBasedEnvBase):
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
         """Never: an imagined end must not trigger a reset.
+
         Args:
             tensordict: not looked at.
+
         Returns:
             ``False``.
         """

@@ -252,7 +252,7 @@ class BoundPrior(Prior):
             missing = [key for key in self._keys if task.get(key, None) is None]
             if missing:
                 raise KeyError(f"task must hold the entries {self._keys}, but lacks {missing}")
-            values = [task.get(key) for key in self._keys]
+            values = [task[key] for key in self._keys]
         for i, value in enumerate(values):
             if not value.isfinite().all():
                 raise ValueError(f"task must be finite, got {value.tolist()}")
