@@ -20,10 +20,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import (
     Bounded,
-    Categorical,
     Composite,
-    MultiOneHot,
-    OneHot,
     TensorSpec,
     Unbounded,
 )
@@ -486,20 +483,6 @@ class TestDefects:
     def test_6_degenerate_bounds_are_refused(self, low: float, high: float) -> None:
         with pytest.raises(ValueError, match="action bounds must satisfy low < high"):
             CEM(reach_env(0.0, Bounded(low, high, (1,))), 2)
-
-    @pytest.mark.parametrize(
-        ("spec", "name"),
-        [
-            (OneHot(3), "OneHot"),
-            (Categorical(3, shape=(1,)), "Categorical"),
-            (MultiOneHot((2, 3)), "MultiOneHot"),
-            (Bounded(0, 3, (2,), dtype=torch.int64), "Bounded"),
-        ],
-    )
-    def test_6_discrete_actions_are_refused(self, spec: TensorSpec, name: str) -> None:
-        message = rf"must be one continuous tensor \(Bounded or Unbounded.*got {name}"
-        with pytest.raises(TypeError, match=message):
-            CEM(reach_env(0.0, spec), 2)
 
 
 class _Scaled:

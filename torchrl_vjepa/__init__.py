@@ -1,5 +1,6 @@
 """Probabilistic joint-embedding world models, their losses, environments and planners, for TorchRL."""
 
+from torchrl_vjepa.actions import ActionCodec, ActionEncoder
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import (
     LinearObservation,
@@ -96,6 +97,7 @@ from torchrl_vjepa.planners import (
     GradientMPC,
     Planner,
     Proposal,
+    ProposalFamily,
     RandomShooting,
     SamplingPlanner,
 )
@@ -132,6 +134,8 @@ from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
+    "ActionCodec",
+    "ActionEncoder",
     "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
@@ -196,6 +200,7 @@ __all__ = [
     "ProbedPrior",
     "ProductPrior",
     "Proposal",
+    "ProposalFamily",
     "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",

@@ -128,6 +128,9 @@ class RewardLoss(WindowLoss):
             self.__dict__["predictor"] = model.predictor
         self._set_in_keys()
 
+    def _action_entry(self) -> tuple[NestedKey, int]:
+        return self.predictor.action_key, self.predictor.action_dim
+
     def _required_keys(self) -> list[NestedKey]:
         if "encoder" not in self.__dict__:  # while the parent is being built
             return []

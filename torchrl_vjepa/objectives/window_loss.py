@@ -13,9 +13,9 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-from torchrl_vjepa.objectives.pairs import mean_over
+from torchrl_vjepa.objectives.pairs import mean_over, normalised_weights
 from torchrl_vjepa.stacking import features_first
-from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
+from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask, with_action_code
 
 __all__ = ["WindowLoss"]
 
@@ -100,7 +100,7 @@ class WindowLoss(LossModule):
         self.stacked_data = stacked_data
         self.reduction = reduction
         self.skips = tuple(skips)
-        self.skip_weights = _normalised(skip_weights, self.skips)
+        self.skip_weights = normalised_weights(skip_weights, self.skips)
         self.__dict__["_models"] = models
         self._modules_of_model = dict(modules)
         for name, attribute in modules.items():
@@ -241,6 +241,10 @@ class WindowLoss(LossModule):
 
     # What a member adds
 
+    def _action_entry(self) -> tuple[NestedKey, int] | None:
+        """Where the model reads the action, and how many numbers it has."""
+        return None
+
     def _required_keys(self) -> list[NestedKey]:
         """Floating-point entries that ``forward`` needs; the last tells the shape of the batch."""
         return [self.encoder.in_keys[0]]
@@ -320,6 +324,7 @@ class WindowLoss(LossModule):
             ValueError: if a window is too short, shapes disagree, or a value that counts is not finite.
         """
         self._check_coeffs()
+        tensordict = with_action_code(tensordict, self._action_entry(), self.encoder.in_keys[0])
         data, masks = self._read(tensordict)
         params = self._params()
         if self.num_models is None or self._stackable:
@@ -391,7 +396,7 @@ class WindowLoss(LossModule):
             if not value.is_floating_point():
                 raise ValueError(
                     f"{key!r} must be floating point, got {value.dtype}; convert it first "
-                    "(ToTensorImage, DoubleToFloat or one-hot actions)"
+                    "(ToTensorImage, DoubleToFloat, or ActionEncoder for multi-categorical actions)"
                 )
         longest = max(self.skips, default=0)
         if batch[-1] <= longest:
@@ -501,18 +506,3 @@ def _blueprint(model: torch.nn.Module) -> dict[str, Any]:
             if plain and not key.startswith("_") and key not in ("training", "init_std"):
                 blueprint[f"{name}.{key}" if name else key] = value
     return blueprint
-
-
-def _normalised(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
-    if weights is None:
-        return tuple(1.0 / len(skips) for _ in skips)
-    if (
-        len(weights) != len(skips)
-        or not all(math.isfinite(w) and w >= 0 for w in weights)
-        or not sum(weights)
-    ):
-        raise ValueError(
-            f"skip_weights must be one finite weight of at least 0 for each of skips={skips}, not all zero, "
-            f"got {tuple(weights)}"
-        )
-    return tuple(float(w) / sum(weights) for w in weights)
