@@ -265,7 +265,7 @@ class Planner(MPCPlannerBase):
         """
         with torch.no_grad():
             code = self._plan_from(td)[1].actions[..., 0, :]
-        return self._executed(code)[0] if len(self.codec.keys) == 1 else self.codec.decode(code)
+        return self.codec.executed(code)[0] if len(self.codec.keys) == 1 else self.codec.decode(code)
 
     def forward(
         self,
@@ -292,7 +292,7 @@ class Planner(MPCPlannerBase):
             raise TypeError(f"{type(self).__name__} takes no keywords, got {sorted(kwargs)}")
         with torch.no_grad():
             state, plan = self._plan_from(tensordict)
-            written = self._executed(plan.actions[..., 0, :])
+            written = self.codec.executed(plan.actions[..., 0, :])
             if self.warm_start:
                 shifted = torch.cat([plan.actions[..., 1:, :], plan.actions[..., -1:, :]], dim=-2)
                 written.append(self._shaped(shifted))
@@ -391,12 +391,6 @@ class Planner(MPCPlannerBase):
         costs = self._source.objective(state, candidates, generator=generator, **asked)
         costs = costs.to(candidates.dtype)
         return torch.where(costs.isfinite(), costs, math.inf)
-
-    def _executed(self, code: Tensor) -> list[Tensor]:
-        """The tensors of the action, in their shapes and dtypes."""
-        if self.codec.is_identity:
-            return [self._shaped(code)]
-        return self.codec.decode_leaves(code)
 
     def _shaped(self, actions: Tensor) -> Tensor:
         return actions.reshape((*actions.shape[:-1], *self.action_shape))

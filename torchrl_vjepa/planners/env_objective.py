@@ -178,7 +178,7 @@ class EnvObjective:
         alive = torch.ones(batch, dtype=torch.bool, device=actions.device)
         for action in actions.unbind(-2):
             current = current.copy()
-            for key, leaf in zip(self.codec.keys, self.codec.decode_leaves(action), strict=True):
+            for key, leaf in zip(self.codec.keys, self.codec.executed(action), strict=True):
                 current.set(key, leaf)
             following = self.env.step(current).get("next")
             reward = following.get(self.reward_key).reshape(*batch, -1).sum(dim=-1)
