@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_vjepa import (
     BJEPA,
+    DeltaHead,
     Density,
     DiagGaussianHead,
     EnsembleHead,
@@ -234,3 +235,11 @@ def test_bad_calls_are_refused() -> None:
     for prior in (None, constant, Density(energy)):
         with pytest.raises(ValueError, match="task must be None for a prior that takes none"):
             FusedPredictor(Predictor(D), prior).dist(torch.zeros(1, D), task=torch.zeros(D))
+
+
+def test_a_flat_prior_takes_a_deterministic_predictor() -> None:
+    predictor = Predictor(D, head=DeltaHead())
+    latent = torch.randn(4, D)
+    fused = FusedPredictor(predictor, Density())
+    assert torch.equal(fused.dist(latent).mean, predictor.dist(latent).mean)
+    assert torch.equal(fused.fuse(latent).posterior.mean, predictor.dist(latent).mean)
