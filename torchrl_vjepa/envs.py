@@ -69,6 +69,13 @@ class LatentEnv(ModelBasedEnvBase):
         prior: of the task; its energy is subtracted from the reward. Of ``reward_model``, ``cost`` and
             ``prior`` at least one must be given; what is given is added up.
         fusion: how the prior enters the cost of a plan; all but ``"energy"`` need sampled trajectories.
+        termination_model: TensorDictModule that reads ``latent_key`` (the next latent) and ``action_key`` and
+            writes ``"termination_logit"`` of shape ``(*B, 1)``, the logit of the episode's end
+            (:class:`~torchrl_vjepa.objectives.TerminationLoss` trains it). Costs of a plan count as far as it
+            lives, :math:`\sum_k \prod_{j<k} (1 - p_j)\,(c_k + p_k c_{\text{end}})`, and a step writes
+            ``terminated`` and ``done``.
+        termination_cost: :math:`c_{\text{end}}`, what an end costs: where costs are positive, ending would
+            otherwise be a way to save them.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
         num_samples: trajectories ``M`` per candidate plan for ``how="sample"`` (1 by default), or from ``M``
             particles of a belief with any ``how`` (64 by default). They share their
@@ -124,6 +131,8 @@ class LatentEnv(ModelBasedEnvBase):
         cost: StageCost | None = None,
         prior: Prior | None = None,
         fusion: Literal["energy", "weight", "propose"] = "energy",
+        termination_model: TensorDictModuleBase | None = None,
+        termination_cost: float = 0.0,
         how: Literal["mean", "mode", "sample"] = "mean",
         num_samples: int | None = None,
         risk: Risk | None = None,
@@ -175,6 +184,7 @@ class LatentEnv(ModelBasedEnvBase):
         world_model = LatentStep(
             predictor, transition, reward_model, cost, how, spec.shape,
             latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key), prior=prior,
+            termination_model=termination_model, termination_cost=termination_cost,
         )  # fmt: skip
         prior_dim = getattr(prior, "latent_dim", None)
         if prior_dim not in (None, latent_dim):
@@ -354,7 +364,7 @@ class LatentEnv(ModelBasedEnvBase):
                 world_model.transition, start, actions, self._following(state, settings), generator
             )
             costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-        costs = costs.sum(dim=-1)
+        costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
         if settings.num_samples is None:
             return costs
         return plan_cost(costs, settings.risk, settings.constraints, latents, actions)

@@ -382,13 +382,17 @@ class WindowLoss(LossModule):
             )
         lead = (batch[0],) if self.stacked_data else ()
         shape = (*lead, -1, batch[-1])
+        dtypes = (value.dtype for value in entries.values() if value.is_floating_point())
+        floating = next(dtypes, torch.get_default_dtype())
         for key, value in entries.items():
             if value.shape[: len(batch)] != batch or value.ndim == len(batch):
                 raise ValueError(
                     f"{key!r} must have shape {(*batch, '...')} like {required[-1]!r}, "
                     f"got {tuple(value.shape)}"
                 )
-            if not value.is_floating_point():
+            if value.dtype == torch.bool:  # flags and one-hot actions
+                entries[key] = value.to(floating)
+            elif not value.is_floating_point():
                 raise ValueError(
                     f"{key!r} must be floating point, got {value.dtype}; convert it first "
                     "(ToTensorImage, DoubleToFloat or one-hot actions)"
