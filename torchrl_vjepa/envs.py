@@ -20,7 +20,7 @@ from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
-from torchrl_vjepa.imagination import Tasks, densities, drawn, imagine, imagine_fused
+from torchrl_vjepa.imagination import Tasks, check_device, densities, drawn, imagine, imagine_fused
 from torchrl_vjepa.latent_step import LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
@@ -194,6 +194,7 @@ class LatentEnv(ModelBasedEnvBase):
             device = "cpu" if parameter is None else parameter.device
         if dtype is None:
             dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
+        check_device(prior, torch.device(device))
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
         self.latent_dim, self.action_dim = latent_dim, action_dim
         self.latent_key = unravel_key(latent_key)

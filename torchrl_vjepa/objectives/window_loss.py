@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_vjepa.objectives.arguments import blueprint, normalised_weights
 from torchrl_vjepa.objectives.pairs import mean_over
 from torchrl_vjepa.stacking import features_first
 from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
@@ -100,7 +101,7 @@ class WindowLoss(LossModule):
         self.stacked_data = stacked_data
         self.reduction = reduction
         self.skips = tuple(skips)
-        self.skip_weights = _normalised(skip_weights, self.skips)
+        self.skip_weights = normalised_weights(skip_weights, self.skips)
         self.__dict__["_models"] = models
         self._modules_of_model = dict(modules)
         for name, attribute in modules.items():
@@ -143,7 +144,7 @@ class WindowLoss(LossModule):
             )
         if len({id(m) for m in models}) != len(models):
             raise ValueError("model must be a list of distinct models, got the same one twice; build each")
-        blueprints = [_blueprint(m) for m in models if len(models) > 1]
+        blueprints = [blueprint(m) for m in models if len(models) > 1]
         for i, other in enumerate(blueprints):
             different = sorted(
                 key for key in blueprints[0] | other if blueprints[0].get(key) != other.get(key)
@@ -488,35 +489,3 @@ class WindowLoss(LossModule):
             return values[0]
         first, *rest = (w * value for w, value in zip(self.skip_weights, values, strict=True))
         return sum(rest, first)
-
-
-def _blueprint(model: torch.nn.Module) -> dict[str, Any]:
-    """What models must share to train as one batch: modules, their settings, shapes of their tensors."""
-    learned = dict(model.named_parameters())
-    blueprint: dict[str, Any] = {
-        f"{name} (tensor)": (tuple(value.shape), "learned" if name in learned else "fixed")
-        for name, value in model.state_dict().items()
-    }
-    for name, module in model.named_modules():
-        blueprint[name] = type(module).__name__
-        for key, value in vars(module).items():
-            # Not where a scale starts: that is a value of the tensor.
-            plain = isinstance(value, (bool, int, float, str, tuple, type(None)))
-            if plain and not key.startswith("_") and key not in ("training", "init_std"):
-                blueprint[f"{name}.{key}" if name else key] = value
-    return blueprint
-
-
-def _normalised(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
-    if weights is None:
-        return tuple(1.0 / len(skips) for _ in skips)
-    if (
-        len(weights) != len(skips)
-        or not all(math.isfinite(w) and w >= 0 for w in weights)
-        or not sum(weights)
-    ):
-        raise ValueError(
-            f"skip_weights must be one finite weight of at least 0 for each of skips={skips}, not all zero, "
-            f"got {tuple(weights)}"
-        )
-    return tuple(float(w) / sum(weights) for w in weights)
