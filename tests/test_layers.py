@@ -20,6 +20,7 @@ PACKAGE = ROOT / "torchrl_vjepa"
 
 # Files and folders directly under the package; a folder's leaves share its layer.
 LAYERS = {
+    "actions": 0,
     "distributions": 0,
     "generators": 0,
     "stacking": 0,

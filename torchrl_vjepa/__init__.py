@@ -1,5 +1,6 @@
 """Probabilistic joint-embedding world models, their losses, environments and planners, for TorchRL."""
 
+from torchrl_vjepa.actions import ActionCodec, ActionEncoder
 from torchrl_vjepa.baselines import VAE, PixelAR, PixelARLoss, PixelDecoder, VAELoss
 from torchrl_vjepa.belief import (
     LinearObservation,
@@ -97,6 +98,7 @@ from torchrl_vjepa.planners import (
     GradientMPC,
     Planner,
     Proposal,
+    ProposalFamily,
     RandomShooting,
     SamplingPlanner,
 )
@@ -133,6 +135,8 @@ from torchrl_vjepa.temperature import temper
 from torchrl_vjepa.whitening import Whitening
 
 __all__ = [
+    "ActionCodec",
+    "ActionEncoder",
     "AdaptiveCoefficient",
     "BJEPA",
     "BJEPALoss",
@@ -197,6 +201,7 @@ __all__ = [
     "ProbedPrior",
     "ProductPrior",
     "Proposal",
+    "ProposalFamily",
     "PseudoLikelihood",
     "QuadraticReward",
     "RandomShooting",

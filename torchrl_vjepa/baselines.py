@@ -375,6 +375,10 @@ class PixelARLoss(WindowLoss):
             reduction=reduction,
         )
 
+    def _action_entry(self) -> tuple[NestedKey, int] | None:
+        keys = self.decoder.in_keys[1:]
+        return (keys[0], self.decoder.module.action_dim) if keys else None
+
     def _required_keys(self) -> list[NestedKey]:
         return [self.encoder.in_keys[0], *self.decoder.in_keys[1:]]
 

@@ -7,7 +7,6 @@ better. :class:`LatentEnv` answers both on plain tensors.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
+from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.imagination import Tasks, check_device, densities, drawn, imagine, imagine_fused
@@ -59,12 +59,13 @@ class LatentEnv(ModelBasedEnvBase):
         model: what predicts: a :class:`~torchrl_vjepa.models.JEPA` or anything with ``predictor``;
             a :class:`~torchrl_vjepa.predictor.Predictor` or anything with ``dist``; or a transition
             ``(latent (*B, D), action (*B, A)) -> Distribution`` with batch ``*B``, event ``(D,)``.
-            Actions of any rank are flattened to ``A`` numbers for it and for ``cost``.
-        action_spec: the actions, without batch dimensions: ``env.action_spec_unbatched`` of the
-            real environment.
+            It and ``cost`` read actions as the flat code of :class:`~torchrl_vjepa.actions.ActionCodec`,
+            ``A`` floats: one-hot codes where actions are discrete.
+        action_spec: the actions of any kind, without batch dimensions: ``env.action_spec_unbatched`` of the
+            real environment, or its ``full_action_spec_unbatched``, which brings its own keys.
         reward_model: TensorDictModule that reads ``latent_key`` (the next latent) and
-            ``action_key`` (in the shape of ``action_spec``) and writes ``reward_key`` with shape
-            ``(*B, 1)``.
+            ``action_key`` (a single continuous action in its own shape, else the flat code) and writes
+            ``reward_key`` with shape ``(*B, 1)``.
         cost: ``(next latent (*B, D), action (*B, A)) -> (*B)``; subtracted from the reward.
         prior: of the task; its energy is subtracted from the reward. Of ``reward_model``, ``cost`` and
             ``prior`` at least one must be given; what is given is added up.
@@ -90,7 +91,8 @@ class LatentEnv(ModelBasedEnvBase):
         belief_key: where a belief is, ``("next", "belief")`` behind a
             :class:`~torchrl_vjepa.belief.ParticleFilter`: planning then starts from ``num_samples`` of
             its particles, the same for all candidates, instead of from the latent.
-        action_key: where the action is; by default the model's, else ``"action"``.
+        action_key: where the action is, if ``action_spec`` is no ``Composite``, and the name under which
+            models read it; by default the model's, else ``"action"``.
         reward_key: where the reward is written.
         device: by default the one of the model's parameters.
         dtype: of the latent; by default the one of the model's parameters.
@@ -99,8 +101,8 @@ class LatentEnv(ModelBasedEnvBase):
         ValueError: if none of ``reward_model``, ``cost`` and ``prior`` is given, a size does not
             fit, or a probe call returns a wrong shape.
         KeyError: if the reward model reads or writes other keys.
-        TypeError: if the model is no transition, the prior no ``Prior`` or the action specification no
-            single tensor.
+        TypeError: if the model is no transition, the prior no ``Prior``, or an action is of a kind that has
+            no code.
 
     Examples:
         >>> import torch
@@ -167,22 +169,23 @@ class LatentEnv(ModelBasedEnvBase):
             )
         latent_key = _first(latent_key, getattr(predictor, "latent_key", None), "latent")
         action_key = _first(action_key, getattr(predictor, "action_key", None), "action")
+        codec = ActionCodec(action_spec, action_key)
         latent_dim = _first(latent_dim, getattr(predictor, "latent_dim", None), None)
         if latent_dim is None or latent_dim < 1:
             raise ValueError(
                 f"latent_dim must be a positive integer, got {latent_dim}; give it where the model "
                 "has no attribute latent_dim"
             )
-        spec = _single_leaf(action_spec, action_key)
-        action_dim = math.prod(spec.shape)
+        action_dim = codec.size
         expected = getattr(predictor, "action_dim", action_dim)
         if action_dim != expected:
             raise ValueError(
                 f"action_spec must hold the predictor's action_dim={expected} numbers, got shape "
-                f"{tuple(spec.shape)}; for a batched environment give action_spec_unbatched"
+                f"{tuple(codec.shape)} of {codec.describe()}; for a batched environment give "
+                "action_spec_unbatched"
             )
         world_model = LatentStep(
-            predictor, transition, reward_model, cost, how, spec.shape,
+            predictor, transition, reward_model, cost, how, codec.shape,
             latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key), prior=prior,
             termination_model=termination_model, termination_cost=termination_cost,
         )  # fmt: skip
@@ -196,6 +199,7 @@ class LatentEnv(ModelBasedEnvBase):
             dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
         check_device(prior, torch.device(device))
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
+        self.codec = codec.to(self.device)
         self.latent_dim, self.action_dim = latent_dim, action_dim
         self.latent_key = unravel_key(latent_key)
         self.planning_keys = [self.latent_key]
@@ -210,9 +214,9 @@ class LatentEnv(ModelBasedEnvBase):
         latent_spec = Unbounded((latent_dim,), device=self.device, dtype=dtype)
         self.observation_spec = Composite({self.latent_key: latent_spec}, device=self.device)
         self.state_spec = Composite({self.latent_key: latent_spec.clone()}, device=self.device)
-        self.full_action_spec = Composite(
-            {unravel_key(action_key): spec.clone().to(self.device)}, device=self.device
-        )
+        if not isinstance(action_spec, Composite):
+            action_spec = Composite({codec.keys[0]: action_spec})
+        self.full_action_spec = action_spec.clone().to(self.device)
         self.full_reward_spec = Composite(
             {unravel_key(reward_key): Unbounded((1,), device=self.device, dtype=dtype)},
             device=self.device,
@@ -473,6 +477,9 @@ class LatentEnv(ModelBasedEnvBase):
         return [*super()._observation_keys_step_mdp, *self.task_keys]
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.codec.is_identity:
+            code = self.codec.encode(tensordict)
+            tensordict = tensordict.copy().set(self.world_model.action_key, code)
         return self.world_model.step(tensordict, self.rng)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -499,14 +506,3 @@ class LatentEnv(ModelBasedEnvBase):
 
 def _first(*values: Any) -> Any:
     return next((value for value in values if value is not None), None)
-
-
-def _single_leaf(spec: TensorSpec, action_key: NestedKey) -> TensorSpec:
-    if not isinstance(spec, Composite):
-        return spec
-    leaves = [unravel_key(key) for key in spec.keys(True, True)]
-    if leaves != [unravel_key(action_key)]:
-        raise TypeError(
-            f"action_spec must be one tensor under action_key={action_key!r}, got the keys {leaves}"
-        )
-    return spec[leaves[0]]

@@ -8,7 +8,15 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-__all__ = ["action_chunks", "check_finite", "read", "step_mask", "pair_mask"]
+__all__ = [
+    "action_chunks",
+    "check_finite",
+    "code_of_windows",
+    "pair_mask",
+    "read",
+    "step_mask",
+    "with_action_code",
+]
 
 
 def read(tensordict: TensorDictBase, key: NestedKey, *, reader: str) -> Tensor:
@@ -151,3 +159,70 @@ def check_finite(value: Tensor, mask: Tensor | None, key: NestedKey) -> None:
             f"{key!r} must be finite at every step that counts, got {int((~finite).sum())} NaN or infinite "
             "values; drop these steps or mark them False in ('collector', 'mask')"
         )
+
+
+def code_of_windows(action: Tensor, batch: torch.Size, size: int, dtype: torch.dtype) -> Tensor:
+    """Discrete actions of a replay buffer as floats: one-hots and bits are cast, indices one-hot encoded.
+
+    Args:
+        action: of shape ``(*B, T, A)``, boolean or integer, or indices of shape ``(*B, T)``,
+            ``(*B, T, 1)``.
+        batch: ``(*B, T)``.
+        size: ``A``.
+        dtype: of the result.
+
+    Returns:
+        Of shape ``(*B, T, A)``; what has another shape is returned as it is, for the caller to refuse.
+
+    Raises:
+        ValueError: if an index is not in ``[0, A)``.
+
+    Examples:
+        >>> code_of_windows(torch.tensor([0, 2]), torch.Size([2]), 3, torch.float32)
+        tensor([[1., 0., 0.],
+                [0., 0., 1.]])
+    """
+    if action.shape == (*batch, size):
+        return action.to(dtype)
+    if action.shape not in (batch, (*batch, 1)) or action.dtype == torch.bool:
+        return action
+    index = action.reshape(*batch, 1)
+    if not torch.compiler.is_compiling() and bool(((index < 0) | (index >= size)).any()):
+        raise ValueError(
+            f"indices of actions must be in [0, {size}), the predictor's action_dim, got "
+            f"{int(index.min())} to {int(index.max())}"
+        )
+    return (index == torch.arange(size, device=action.device)).to(dtype)
+
+
+def with_action_code(
+    tensordict: TensorDictBase, entry: tuple[NestedKey, int] | None, observation_key: NestedKey
+) -> TensorDictBase:
+    """Windows in which discrete actions are floats.
+
+    Args:
+        tensordict: the windows; not changed.
+        entry: where the action is, and how many numbers a model reads; ``None`` if it reads none.
+        observation_key: an entry that tells the batch dimensions, and the dtype of the code.
+
+    Returns:
+        The same windows, or a shallow copy with the code in the place of the action.
+
+    Raises:
+        ValueError: if an index is not in ``[0, A)``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> observation = torch.zeros(1, 2, 5)
+        >>> windows = TensorDict(action=torch.tensor([[0, 1]]), observation=observation, batch_size=(1, 2))
+        >>> with_action_code(windows, ("action", 3), "observation")["action"].shape
+        torch.Size([1, 2, 3])
+    """
+    if entry is None or not entry[1]:
+        return tensordict
+    key, size = entry
+    action, observation = tensordict.get(key, None), tensordict.get(observation_key, None)
+    if action is None or observation is None or action.is_floating_point():
+        return tensordict
+    batch = observation.shape[: -max(1, observation.ndim - tensordict.ndim)]
+    return tensordict.copy().set(key, code_of_windows(action, batch, size, observation.dtype))

@@ -170,6 +170,9 @@ class LatentPredictionLoss(WindowLoss):
         own.data.update_(params.data if index is None else params.data[index])
         return encoder.requires_grad_(False).eval()
 
+    def _action_entry(self) -> tuple[NestedKey, int]:
+        return self.predictor.action_key, self.predictor.action_dim
+
     def _required_keys(self) -> list[NestedKey]:
         return [self.encoder.in_keys[0], *self.predictor.in_keys[1:]]
 

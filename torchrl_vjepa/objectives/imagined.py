@@ -104,6 +104,9 @@ class ImaginedLoss(WindowLoss, abc.ABC):
     def _errors(self, predicted: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
         """Losses and what is reported beside them, each of the shape ``(B, N, num_steps)``."""
 
+    def _action_entry(self) -> tuple[NestedKey, int]:
+        return self.predictor.action_key, self.predictor.action_dim
+
     def _required_keys(self) -> list[NestedKey]:
         if "encoder" not in self.__dict__:  # while the parent is being built
             return []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -10,7 +12,7 @@ from torch.distributions import Distribution
 
 from torchrl_vjepa.stacking import products
 
-__all__ = ["Pairs", "mean_over", "rows_of", "second_moment"]
+__all__ = ["Pairs", "mean_over", "normalised_weights", "rows_of", "second_moment"]
 
 
 class Pairs(NamedTuple):
@@ -99,3 +101,34 @@ def second_moment(value: Tensor, mask: Tensor | None) -> Tensor:
         return products(value) / value.shape[-2]
     count = mask.sum(-1).clamp_min(1)[..., None, None]
     return products(torch.where(mask.unsqueeze(-1), value, 0)) / count
+
+
+def normalised_weights(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
+    """Weights of the skips that sum to one.
+
+    Args:
+        weights: one for each skip; equal by default.
+        skips: the skips.
+
+    Returns:
+        The weights.
+
+    Raises:
+        ValueError: if they are not one non-negative finite number for each skip, or all zero.
+
+    Examples:
+        >>> normalised_weights([1.0, 3.0], (1, 2))
+        (0.25, 0.75)
+    """
+    if weights is None:
+        return tuple(1.0 / len(skips) for _ in skips)
+    if (
+        len(weights) != len(skips)
+        or not all(math.isfinite(w) and w >= 0 for w in weights)
+        or not sum(weights)
+    ):
+        raise ValueError(
+            f"skip_weights must be one finite weight of at least 0 for each of skips={skips}, not all zero, "
+            f"got {tuple(weights)}"
+        )
+    return tuple(float(w) / sum(weights) for w in weights)

@@ -13,10 +13,10 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-from torchrl_vjepa.objectives.arguments import blueprint, normalised_weights
-from torchrl_vjepa.objectives.pairs import mean_over
+from torchrl_vjepa.objectives.blueprint import blueprint
+from torchrl_vjepa.objectives.pairs import mean_over, normalised_weights
 from torchrl_vjepa.stacking import features_first
-from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask
+from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask, with_action_code
 
 __all__ = ["WindowLoss"]
 
@@ -242,6 +242,10 @@ class WindowLoss(LossModule):
 
     # What a member adds
 
+    def _action_entry(self) -> tuple[NestedKey, int] | None:
+        """Where the model reads the action, and how many numbers it has."""
+        return None
+
     def _required_keys(self) -> list[NestedKey]:
         """Floating-point entries that ``forward`` needs; the last tells the shape of the batch."""
         return [self.encoder.in_keys[0]]
@@ -321,6 +325,7 @@ class WindowLoss(LossModule):
             ValueError: if a window is too short, shapes disagree, or a value that counts is not finite.
         """
         self._check_coeffs()
+        tensordict = with_action_code(tensordict, self._action_entry(), self.encoder.in_keys[0])
         data, masks = self._read(tensordict)
         params = self._params()
         if self.num_models is None or self._stackable:
@@ -396,7 +401,7 @@ class WindowLoss(LossModule):
             elif not value.is_floating_point():
                 raise ValueError(
                     f"{key!r} must be floating point, got {value.dtype}; convert it first "
-                    "(ToTensorImage, DoubleToFloat or one-hot actions)"
+                    "(ToTensorImage, DoubleToFloat, or ActionEncoder for multi-categorical actions)"
                 )
         longest = max(self.skips, default=0)
         if batch[-1] <= longest:

@@ -5,7 +5,7 @@ from torchrl_vjepa.planners.cem import CEM
 from torchrl_vjepa.planners.env_objective import EnvObjective
 from torchrl_vjepa.planners.gradient import GradientMPC
 from torchrl_vjepa.planners.mppi import MPPI
-from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.proposal import Proposal, ProposalFamily
 from torchrl_vjepa.planners.random_shooting import RandomShooting
 from torchrl_vjepa.planners.sampling import SamplingPlanner
 
@@ -17,6 +17,7 @@ __all__ = [
     "Plan",
     "Planner",
     "Proposal",
+    "ProposalFamily",
     "RandomShooting",
     "SamplingPlanner",
 ]

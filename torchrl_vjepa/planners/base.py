@@ -16,9 +16,10 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import MPCPlannerBase
 
+from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
-from torchrl_vjepa.planners.proposal import Proposal, continuous_action, gaussian_of_bounds
+from torchrl_vjepa.planners.proposal import Proposal, ProposalFamily
 from torchrl_vjepa.risk import REJECTED_COST, ChanceConstraint, Risk
 
 __all__ = ["Plan", "Planner"]
@@ -30,7 +31,7 @@ class Plan(NamedTuple):
     """What a planning call found.
 
     Attributes:
-        actions: the plan, of shape ``(*B, H, A)``; its first step is executed.
+        actions: the plan, in code, of shape ``(*B, H, A)``; its first step is executed.
         std: spread of the last proposal, of shape ``(*B, H, A)``.
         best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
         best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite, at least
@@ -68,6 +69,14 @@ class Planner(MPCPlannerBase):
     the bounds.
     ``get_env_transforms_from_module(policy)`` gives the environment what it needs.
 
+    **Any action.** Plans are searched in the flat code of :class:`~torchrl_vjepa.actions.ActionCodec`, ``A``
+    floats: itself where the action is one continuous tensor, one-hot blocks and bits where it is discrete,
+    one after the other where there are several. What is executed is decoded: all tensors of the action, in
+    the shapes and dtypes of the specification. The entries that hold whole plans (``plan_key``,
+    ``("plan_stats", "actions")``, ``std``) have the action's shape for one continuous tensor, and stay in
+    code otherwise. Zeros then are a cold start only without ``init_key``: bits may all be zero in a plan.
+    Masks of the specification (``OneHot``, ``Categorical``) hold for all steps of a plan.
+
     **Randomness** comes from a generator of the planner's own; the global random state is never
     touched. All rows of a batch see the same noise: planning for many environments at once equals
     planning for each alone from the same generator state, in any order. The generator's state
@@ -79,9 +88,10 @@ class Planner(MPCPlannerBase):
             batch-locked, which is then stepped (see :class:`EnvObjective`).
         planning_horizon: steps ``H`` that are imagined.
         optim_steps: rounds of the search.
-        action_key: where the action is written; the environment's by default.
+        action_key: where the action is written, if it is one tensor; the environment's by default.
         warm_start: start from the plan of the step before.
-        warm_std: the spread after a warm start, as a fraction of the one after a cold start.
+        warm_std: the spread after a warm start, as a fraction of the one after a cold start; for discrete
+            actions, the probability with which a choice is drawn anew.
         init_std: spread of the proposal after a cold start: a fraction of half the range where the
             action is bounded (0.5 by default), in units of the action where it is not (no default).
         num_samples: trajectories ``M`` imagined for each plan; the environment's way by default.
@@ -104,7 +114,7 @@ class Planner(MPCPlannerBase):
     Raises:
         ValueError: if an argument is out of its range, the bounds of an action are degenerate, or a risk
             or constraint has no samples to read.
-        TypeError: if the action is not one continuous tensor, or the environment cannot evaluate the risk
+        TypeError: if an action is of a kind that has no code, or the environment cannot evaluate the risk
             or constraints.
 
     Examples:
@@ -134,11 +144,6 @@ class Planner(MPCPlannerBase):
         tensor([0.5000])
     """
 
-    low: Tensor
-    high: Tensor
-    centre: Tensor
-    cold_std: Tensor
-
     def __init__(
         self,
         env: EnvBase,
@@ -166,11 +171,15 @@ class Planner(MPCPlannerBase):
             raise ValueError(f"init_std must be positive and finite, got {init_std}")
         if seed is not None and generator is not None:
             raise ValueError("at most one of seed and generator must be given, got both")
-        leaves = [unravel_key(key) for key in env.full_action_spec.keys(True, True)]
-        spec = continuous_action(env.full_action_spec[leaves[0]] if len(leaves) == 1 else None, leaves)
-        low, high, centre, std = gaussian_of_bounds(spec, init_std)
-        written = leaves[0] if action_key is None else unravel_key(action_key)
-        super().__init__(env, written)
+        codec = ActionCodec(env.full_action_spec)
+        family = ProposalFamily(codec, init_std)
+        if action_key is not None and len(codec.keys) > 1:
+            raise ValueError(
+                f"action_key must be None for the several actions {codec.keys}, got {action_key!r}"
+            )
+        written = codec.keys if action_key is None else [unravel_key(action_key)]
+        super().__init__(env, written[0])
+        self.codec, self.family = codec, family
         # Looked up on the class: a transform around a LatentEnv must be stepped, not bypassed.
         offers_objective = callable(getattr(type(env), "objective", None))
         self._env_objective = None if offers_objective else EnvObjective(env)
@@ -181,12 +190,10 @@ class Planner(MPCPlannerBase):
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
         self.warm_start, self.warm_std, self.return_stats = warm_start, warm_std, return_stats
         self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
-        self.action_shape = tuple(spec.shape)
-        for name, tensor in (("low", low), ("high", high), ("centre", centre), ("cold_std", std)):
-            self.register_buffer(name, tensor.flatten(), persistent=False)
+        self.action_shape = tuple(codec.shape)
         own = self._env_objective
         reads = list(env.planning_keys if own is None else own.in_keys)
-        writes = [written]
+        writes = list(written)
         if warm_start:
             reads += [self.plan_key, self.init_key]
             writes.append(unravel_key(("next", self.plan_key)))
@@ -199,6 +206,26 @@ class Planner(MPCPlannerBase):
             generator.manual_seed(torch.initial_seed() if seed is None else seed)
         self._generator = generator
         self._model_generator = _offspring(generator, generator.device)
+
+    @property
+    def low(self) -> Tensor:
+        """Lower bounds of the code, ``(A)``."""
+        return self.family.low
+
+    @property
+    def high(self) -> Tensor:
+        """Upper bounds of the code, ``(A)``."""
+        return self.family.high
+
+    @property
+    def centre(self) -> Tensor:
+        """Mean of the proposal after a cold start, ``(A)``."""
+        return self.family.centre
+
+    @property
+    def cold_std(self) -> Tensor:
+        """Its spread, ``(A)``."""
+        return self.family.cold_std
 
     @property
     def generator(self) -> torch.Generator:
@@ -227,18 +254,18 @@ class Planner(MPCPlannerBase):
             primers[self.plan_key] = Unbounded(shape, device=self.low.device, dtype=self.low.dtype)
         return TensorDictPrimer(Composite(primers), expand_specs=True)
 
-    def planning(self, td: TensorDictBase) -> Tensor:
+    def planning(self, td: TensorDictBase) -> Tensor | TensorDictBase:
         """The action to execute.
 
         Args:
             td: where to plan from.
 
         Returns:
-            Actions of shape ``(*B, *action_shape)``.
+            Actions of shape ``(*B, *shape)``; a tensordict of them where there are several.
         """
         with torch.no_grad():
-            plan = self._plan_from(td)[1]
-        return self._shaped(plan.actions[..., 0, :])
+            code = self._plan_from(td)[1].actions[..., 0, :]
+        return self._executed(code)[0] if len(self.codec.keys) == 1 else self.codec.decode(code)
 
     def forward(
         self,
@@ -265,7 +292,7 @@ class Planner(MPCPlannerBase):
             raise TypeError(f"{type(self).__name__} takes no keywords, got {sorted(kwargs)}")
         with torch.no_grad():
             state, plan = self._plan_from(tensordict)
-            written = [self._shaped(plan.actions[..., 0, :])]
+            written = self._executed(plan.actions[..., 0, :])
             if self.warm_start:
                 shifted = torch.cat([plan.actions[..., 1:, :], plan.actions[..., -1:, :]], dim=-2)
                 written.append(self._shaped(shifted))
@@ -313,25 +340,25 @@ class Planner(MPCPlannerBase):
 
     def _start(self, tensordict: TensorDictBase, batch: torch.Size) -> Proposal:
         """Proposal from the plan of the step before where there is one, else from the bounds."""
-        shape = (*batch, self.planning_horizon, self.low.shape[0])
-        mean, std = self.centre.expand(shape), self.cold_std.expand(shape)
+        cold = self.family.cold(batch, self.planning_horizon)
         plan = tensordict.get(self.plan_key, None) if self.warm_start else None
         if plan is None:
-            return Proposal(mean, std)
+            return cold
         expected = (*batch, self.planning_horizon, *self.action_shape)
         if tuple(plan.shape) != expected:
             raise ValueError(f"{self.plan_key!r} must have shape {expected}, got {tuple(plan.shape)}")
-        plan = plan.to(mean.dtype).reshape(shape)
+        plan = plan.to(cold.mean.dtype).reshape(cold.mean.shape)
         rows = plan.flatten(-2)
-        warm = rows.isfinite().all(dim=-1) & (rows != 0).any(dim=-1)
+        warm = rows.isfinite().all(dim=-1)
         is_init = tensordict.get(self.init_key, None)
         if is_init is not None:
             warm = warm & ~is_init.reshape(batch).bool()
+        if is_init is None or self.codec.is_continuous:
+            warm = warm & (rows != 0).any(dim=-1)  # bits may all be zero, and a plan
         warm = warm[..., None, None]
-        return Proposal(
-            torch.where(warm, plan.clamp(self.low, self.high), mean),
-            torch.where(warm, self.warm_std * std, std),
-        )
+        # Not a number would stay one through the mixing, and be chosen by no row that is warm.
+        start = self.family.around(torch.where(warm, plan, 0.0), self.warm_std)
+        return Proposal(*(torch.where(warm, a, b) for a, b in zip(start, cold, strict=True)))
 
     def _checked_sampling(self, asked: dict[str, Any]) -> bool:
         """Refuse early what the environment cannot evaluate; true if there are constraints."""
@@ -364,6 +391,12 @@ class Planner(MPCPlannerBase):
         costs = self._source.objective(state, candidates, generator=generator, **asked)
         costs = costs.to(candidates.dtype)
         return torch.where(costs.isfinite(), costs, math.inf)
+
+    def _executed(self, code: Tensor) -> list[Tensor]:
+        """The tensors of the action, in their shapes and dtypes."""
+        if self.codec.is_identity:
+            return [self._shaped(code)]
+        return self.codec.decode_leaves(code)
 
     def _shaped(self, actions: Tensor) -> Tensor:
         return actions.reshape((*actions.shape[:-1], *self.action_shape))

@@ -16,7 +16,8 @@ class CEM(SamplingPlanner):
 
     The next proposal has the mean of the elites, all counting the same, and their root mean square
     distance from the mean *before* (see :func:`weighted_gaussian`). Only the ranking of costs
-    matters: any increasing function of the cost gives the same plan.
+    matters: any increasing function of the cost gives the same plan. Where actions are discrete this is
+    the categorical cross-entropy method: the next proposal has the frequencies of the elites' choices.
     Takes the arguments of :class:`SamplingPlanner`, positional ones in the order of TorchRL's
     ``CEMPlanner``.
 

@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, plan_cost
 
 __all__ = ["EnvObjective"]
@@ -32,7 +33,7 @@ class EnvObjective:
 
     Raises:
         ValueError: if the environment is batch-locked, or has several rewards and none is named.
-        TypeError: if its action is no single tensor.
+        TypeError: if its actions have no code (see :class:`~torchrl_vjepa.actions.ActionCodec`).
 
     Examples:
         >>> import torch
@@ -68,12 +69,10 @@ class EnvObjective:
             reward_key = env.reward_keys[0]
         self.env = env
         self.reward_key = unravel_key(reward_key)
-        self.action_key = unravel_key(env.action_key)
-        leaves = [*env.full_action_spec.keys(True, True)]
-        if len(leaves) != 1:
-            raise TypeError(f"the action of env must be one tensor, got the keys {leaves}")
-        self.action_shape = env.full_action_spec[leaves[0]].shape
-        own = {self.action_key, *map(unravel_key, (*env.done_keys, *env.reward_keys))}
+        self.codec = ActionCodec(env.full_action_spec)
+        # A LatentEnv's model reads the code of the action, which the environment makes itself.
+        code_key = getattr(getattr(base, "world_model", None), "action_key", None)
+        own = {code_key, *self.codec.keys, *map(unravel_key, (*env.done_keys, *env.reward_keys))}
         reads = [*env.full_state_spec.keys(True, True)]
         if not reads:
             reads = [*env.observation_spec.keys(True, True)]
@@ -150,7 +149,7 @@ class EnvObjective:
 
         Args:
             state: what :meth:`planning_state` returned, with batch size ``*B``.
-            actions: candidate plans, of shape ``(*B, N, H, A)``.
+            actions: candidate plans, in code, of shape ``(*B, N, H, A)``.
             generator: not used: the environment draws from its own random state.
             num_samples: trajectories per plan; ``None``: one, whose cost is taken as it is.
             risk: of their costs; ``None``: the expectation.
@@ -178,8 +177,9 @@ class EnvObjective:
         cost = actions.new_zeros(batch)
         alive = torch.ones(batch, dtype=torch.bool, device=actions.device)
         for action in actions.unbind(-2):
-            shaped = action.reshape((*batch, *self.action_shape))
-            current = current.copy().set(self.action_key, shaped)
+            current = current.copy()
+            for key, leaf in zip(self.codec.keys, self.codec.decode_leaves(action), strict=True):
+                current.set(key, leaf)
             following = self.env.step(current).get("next")
             reward = following.get(self.reward_key).reshape(*batch, -1).sum(dim=-1)
             cost = cost - torch.where(alive, reward, 0.0)

@@ -75,7 +75,8 @@ class GradientMPC(Planner):
     Raises:
         ValueError: if an argument is out of its range, or there are chance constraints; else see
             :class:`Planner`. When planning: if no gradient flows from the actions to the cost.
-        TypeError: if ``optimizer`` does not make an optimiser; else see :class:`Planner`.
+        TypeError: if actions are discrete, or ``optimizer`` does not make an optimiser; else see
+            :class:`Planner`.
 
     Examples:
         >>> import torch
@@ -119,6 +120,11 @@ class GradientMPC(Planner):
         if max_ms is not None and not 0 < max_ms < math.inf:
             raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        if not self.codec.is_continuous:
+            raise TypeError(
+                "the actions of env must be continuous for gradient planning, got "
+                f"{self.codec.describe()}; use a sampling planner (CEM, MPPI) for discrete ones"
+            )
         if self._constrained:
             raise ValueError(
                 "constraints must be empty for gradient planning: the frequency of violations has no "

@@ -21,7 +21,8 @@ class SamplingPlanner(Planner):
     r"""Sampling-based model predictive control: propose plans, imagine them, refine the proposal.
 
     Each of ``optim_steps`` rounds draws ``num_candidates`` action sequences of length
-    ``planning_horizon`` from a Gaussian clamped to the action bounds, evaluates them in one call of
+    ``planning_horizon`` from the proposal (a Gaussian clamped to the action bounds; independent
+    categorical distributions where actions are discrete), evaluates them in one call of
     the environment's objective, and hands the ``top_k`` best to :meth:`update`, the one method in
     which planners differ. The proposal's mean and the best plan so far are candidates of every
     round (if there are at least three), so the best plan never gets worse. The spread never
@@ -42,9 +43,11 @@ class SamplingPlanner(Planner):
         optim_steps: rounds.
         num_candidates: plans ``N`` per round.
         top_k: elites ``K`` that refine the proposal; ``num_candidates // 8`` by default.
-        min_std: floor under the spread, as a fraction of the one after a cold start.
+        min_std: floor under the spread, as a fraction of the one after a cold start; for discrete actions,
+            the weight of the uniform distribution in the proposal.
         antithetic: draw noise in pairs of opposite sign.
-        output: the plan is the ``"mean"`` of the proposal, or the ``"best"`` candidate seen.
+        output: the plan is the ``"mean"`` of the proposal (where actions are discrete its most probable
+            plan), or the ``"best"`` candidate seen.
         **kwargs: see :class:`Planner`.
 
     Raises:
@@ -127,9 +130,8 @@ class SamplingPlanner(Planner):
         Returns:
             The plan. No value leaves the device.
         """
-        low, high = self.low, self.high
-        floor = self.min_std * self.cold_std
-        best = proposal.mean
+        codec, family = self.codec, self.family
+        best = codec.mode(proposal.mean)
         best_cost = best.new_full(best.shape[:-2], math.inf)
         model_state = self._model_generator.get_state()
         for _ in range(self.optim_steps):
@@ -148,10 +150,10 @@ class SamplingPlanner(Planner):
             best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
             best_cost = torch.where(better, elite_costs[..., 0], best_cost)
             mean, std = self.update(proposal, elites, elite_costs)
-            mean = torch.where(found, mean, proposal.mean).clamp(low, high)
-            std = torch.where(found, std, proposal.std).clamp(floor, self.cold_std)
-            proposal = Proposal(mean, std)
-        actions = proposal.mean if self.output == "mean" else best
+            mean = torch.where(found, mean, proposal.mean)
+            std = torch.where(found, std, proposal.std)
+            proposal = family.confine(Proposal(mean, std), self.min_std)
+        actions = codec.mode(proposal.mean) if self.output == "mean" else best
         if self._constrained and self.output == "mean":
             # The mean of feasible plans may be none (around an obstacle it lies in it).
             self._model_generator.set_state(model_state)
@@ -162,21 +164,20 @@ class SamplingPlanner(Planner):
 
     def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
-        mean, std = proposal
+        mean = proposal.mean
         num = self.num_candidates
         drawn = (num + 1) // 2 if self.antithetic else num
         noise = torch.randn(
-            (drawn, *mean.shape[-2:]),
+            (drawn, mean.shape[-2], self.family.noise_dim),
             generator=self._generator,
             device=mean.device,
             dtype=mean.dtype,
         )
         if self.antithetic:
             noise = torch.cat([noise, -noise])[:num]
-        candidates = torch.addcmul(mean.unsqueeze(-3), std.unsqueeze(-3), noise)
-        candidates = candidates.clamp_(self.low, self.high)
+        candidates = self.family.draw(proposal, noise)
         if num > 1:
-            candidates[..., 0, :, :] = mean
+            candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
         return candidates

@@ -1,14 +1,12 @@
-"""Arguments of losses: weights of skips, and lists of models that train as one batch."""
+"""What models must have in common to train as one batch."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 
-__all__ = ["blueprint", "normalised_weights"]
+__all__ = ["blueprint"]
 
 
 def blueprint(model: torch.nn.Module) -> dict[str, Any]:
@@ -37,34 +35,3 @@ def blueprint(model: torch.nn.Module) -> dict[str, Any]:
             if plain and not key.startswith("_") and key not in ("training", "init_std"):
                 found[f"{name}.{key}" if name else key] = value
     return found
-
-
-def normalised_weights(weights: Sequence[float] | None, skips: tuple[int, ...]) -> tuple[float, ...]:
-    """Weights of skips that sum to one.
-
-    Args:
-        weights: one for each skip; equal by default.
-        skips: the skips.
-
-    Returns:
-        One for each skip.
-
-    Raises:
-        ValueError: if their number is wrong, or they are negative, not finite or all zero.
-
-    Examples:
-        >>> normalised_weights((1.0, 3.0), (1, 4))
-        (0.25, 0.75)
-    """
-    if weights is None:
-        return tuple(1.0 / len(skips) for _ in skips)
-    if (
-        len(weights) != len(skips)
-        or not all(math.isfinite(w) and w >= 0 for w in weights)
-        or not sum(weights)
-    ):
-        raise ValueError(
-            f"skip_weights must be one finite weight of at least 0 for each of skips={skips}, not all zero, "
-            f"got {tuple(weights)}"
-        )
-    return tuple(float(w) / sum(weights) for w in weights)
