@@ -59,7 +59,8 @@ class EnergyWell(Well):
 
 def make_env(prior: Prior | None = None, **kwargs: Any) -> LatentEnv:
     spec = kwargs.pop("action_spec", Bounded(-2, 2, (1,), dtype=torch.float64))
-    return LatentEnv(gaussian, action_spec=spec, prior=prior, latent_dim=2, dtype=torch.float64, **kwargs)
+    kwargs.setdefault("dtype", torch.float64)
+    return LatentEnv(gaussian, action_spec=spec, prior=prior, latent_dim=2, **kwargs)
 
 
 def state_of(env: LatentEnv, batch: tuple[int, ...] = (3,), **tasks: Tensor) -> Any:
@@ -228,6 +229,10 @@ class TestCosts:
     ) -> None:
         with pytest.raises(error, match=message):
             make_env(**{"prior": GaussianPrior(2).double(), **kwargs})
+
+    def test_a_prior_on_another_device_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="prior must be on the device of the model, cpu, got meta"):
+            make_env(GaussianPrior(2).to("meta"), dtype=torch.float64, device="cpu")
 
     def test_an_energy_of_the_wrong_shape_is_refused(self) -> None:
         class Wrong(Prior):

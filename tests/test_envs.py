@@ -259,7 +259,7 @@ class TestReward:
     def test_wrong_keys_are_refused(self) -> None:
         with pytest.raises(KeyError, match=r"must read only latent_key='latent'"):
             make_env(reward_model=reward_module(latent_key="z"))
-        with pytest.raises(KeyError, match=r"must write reward_key='reward'"):
+        with pytest.raises(KeyError, match=r"reward_model must write 'reward'"):
             make_env(reward_model=reward_module(reward_key="r"))
 
 

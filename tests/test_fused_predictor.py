@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_vjepa import (
     BJEPA,
+    DeltaHead,
     Density,
     DiagGaussianHead,
     EnsembleHead,
@@ -28,6 +29,7 @@ from torchrl_vjepa import (
     Prior,
     diag_gaussian,
     linear_encoder,
+    point_estimate,
     product_of_experts,
     rollout,
 )
@@ -56,8 +58,8 @@ def quadratic() -> GaussianFactor:
 class Goal(Prior):
     """A Gaussian around the task."""
 
-    def __init__(self) -> None:
-        super().__init__(task_key="goal", latent_dim=D)
+    def __init__(self, task_key: str = "goal") -> None:
+        super().__init__(task_key=task_key, latent_dim=D)
 
     def forward(self, task: Any = None) -> Any:
         return diag_gaussian(self.own_task(task), torch.full((D,), 0.5))
@@ -129,6 +131,14 @@ def test_reads_the_task_of_the_next_step() -> None:
         fused.dist(latent, action)
 
 
+def test_a_task_may_be_what_the_predictor_reads_too() -> None:
+    fused = FusedPredictor(Predictor(D, side_info_dim=D), Goal("side_info"))
+    assert fused.in_keys == ["latent", "side_info"]
+    data = TensorDict(latent=torch.randn(4, D), side_info=torch.randn(4, D), batch_size=4)
+    expected = fused.dist(data["latent"], side_info=data["side_info"], task=data["side_info"]).mean
+    torch.testing.assert_close(fused(data)["next", "latent"], expected)
+
+
 def test_a_bound_prior_makes_a_transition_of_latent_and_action() -> None:
     goal = torch.randn(D)
     fused = FusedPredictor(Predictor(D, A), Goal().bind(goal))
@@ -145,12 +155,20 @@ def test_a_bound_prior_makes_a_transition_of_latent_and_action() -> None:
 
 @pytest.mark.parametrize("how", ["mean", "mode", "sample"])
 def test_statistics_and_points_of_an_importance_weighted_posterior(how: Any) -> None:
-    fused = FusedPredictor(Predictor(D, A, how=how), constant, num_particles=32, return_stats=True)
+    generator = torch.Generator().manual_seed(0)
+    fused = FusedPredictor(
+        Predictor(D, A, how=how), constant, num_particles=32, return_stats=True, generator=generator
+    )
     data = TensorDict(latent=torch.randn(4, D), action=torch.randn(4, A), batch_size=4)
     out = fused(data)
     size = out["fusion_stats", "effective_sample_size"]
     assert ((size >= 1) & (size < 32)).all()
-    assert out["next", "latent"].shape == (4, D)
+    generator = torch.Generator().manual_seed(0)
+    fusion = fused.fuse(data["latent"], data["action"], generator=generator)
+    torch.testing.assert_close(
+        out["next", "latent"], point_estimate(fusion.posterior, how, generator=generator)
+    )
+    torch.testing.assert_close(out["fusion_stats", "log_evidence"], fusion.log_evidence)
 
 
 def test_randomness_comes_from_the_generator() -> None:
@@ -217,3 +235,11 @@ def test_bad_calls_are_refused() -> None:
     for prior in (None, constant, Density(energy)):
         with pytest.raises(ValueError, match="task must be None for a prior that takes none"):
             FusedPredictor(Predictor(D), prior).dist(torch.zeros(1, D), task=torch.zeros(D))
+
+
+def test_a_flat_prior_takes_a_deterministic_predictor() -> None:
+    predictor = Predictor(D, head=DeltaHead())
+    latent = torch.randn(4, D)
+    fused = FusedPredictor(predictor, Density())
+    assert torch.equal(fused.dist(latent).mean, predictor.dist(latent).mean)
+    assert torch.equal(fused.fuse(latent).posterior.mean, predictor.dist(latent).mean)

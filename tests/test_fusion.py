@@ -178,6 +178,14 @@ def test_contradicting_experts_are_finite() -> None:
     assert far.posterior.mean.item() == pytest.approx(0.0, abs=1e-9)
 
 
+def test_the_evidence_of_far_components_keeps_its_digits() -> None:
+    """Read where densities are near one: between components both are 1e5 nats down."""
+    p = Mixture(torch.zeros(2), diag_gaussian(torch.tensor([[0.3], [1000.0]]), torch.ones(1)))
+    evidence = fuse(p, diag_gaussian(torch.zeros(1), torch.ones(1))).log_evidence
+    expected = Normal(0.3, math.sqrt(2)).log_prob(torch.zeros(())) - math.log(2)
+    torch.testing.assert_close(evidence, expected, rtol=0, atol=1e-5)
+
+
 def test_what_has_a_closed_form() -> None:
     normals = (normal(), full(), factor())
     assert has_closed_form(*normals, mixture())
@@ -290,6 +298,10 @@ def test_batches_of_both_broadcast() -> None:
     assert fuse(p, goal).log_evidence.shape == (5, 3)
     own = Independent(Laplace(torch.zeros(5, 1, 2), torch.ones(2)), 1)
     assert fuse(own, goal).posterior.mean.shape == (5, 3, 2)
+    scales = torch.arange(5.0, dtype=F64)
+    measured = GaussianFactor(torch.eye(1, dtype=F64), torch.zeros(1, dtype=F64), scales)
+    evidence = fuse(mixture().expand((5,)), measured).log_evidence
+    torch.testing.assert_close(evidence - scales, evidence[:1].expand(5))
     tasks = torch.randn(3, 2)
     energy = Density(lambda z: (z - tasks).square().sum(-1))
     assert fuse(p.expand((5, 3)), energy).posterior.mean.shape == (5, 3, 2)

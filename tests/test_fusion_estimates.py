@@ -108,9 +108,10 @@ def test_langevin_keeps_its_density_whatever_the_step(step_size: float) -> None:
     torch.testing.assert_close(torch.cov(chains.mT), COVARIANCE, rtol=0, atol=5 * math.sqrt(2 / 6000))
 
 
-def test_langevin_leaves_where_there_is_no_density() -> None:
+@pytest.mark.parametrize("outside", [-math.inf, math.nan])
+def test_langevin_leaves_where_there_is_no_density(outside: float) -> None:
     def half(z: Tensor) -> Tensor:
-        return torch.where(z[..., 0] > 0, -z[..., 0].square(), -math.inf)
+        return torch.where(z[..., 0] > 0, -z[..., 0].square(), outside)
 
     chains = langevin(half, torch.full((50, 1), -0.5), num_steps=60, step_size=1.0, generator=seeded())
     assert (chains > 0).all()
@@ -134,8 +135,10 @@ def test_latent_map_of_a_quadratic_energy_is_the_product_of_experts(name: str) -
     expected = product_of_experts(p, diag_gaussian(goal, torch.full((2,), 0.5, dtype=F64))).mean
     torch.testing.assert_close(point, expected, rtol=0, atol=5e-3)
     torch.testing.assert_close(value, p.log_prob(point) + prior.log_prob(point))
-    known, _ = map_estimate(p, diag_gaussian(goal, torch.full((2,), 0.5, dtype=F64)))
+    expert = diag_gaussian(goal, torch.full((2,), 0.5, dtype=F64))
+    known, value = map_estimate(p, expert)
     torch.testing.assert_close(known, expected)
+    torch.testing.assert_close(value, p.log_prob(known) + expert.log_prob(known))
 
 
 @pytest.mark.parametrize("name", OPTIMIZERS)

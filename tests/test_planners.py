@@ -875,7 +875,7 @@ class _NegativeDistance(nn.Module):
 class TestEnvObjective:
     def test_equals_the_latent_env_of_the_same_system(self) -> None:
         objective = EnvObjective(WrapperEnv())
-        td, actions = states(3), torch.randn(3, 5, 4, 2)
+        td, actions = states(3), torch.randn(3, 5, 4, 2).clamp(-1, 1)
         torch.testing.assert_close(
             objective.objective(objective.planning_state(td), actions),
             lqr_env(cost=quadratic_cost(torch.ones(2))).objective(td["latent"], actions),

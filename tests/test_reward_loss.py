@@ -264,7 +264,7 @@ def test_missing_entries_are_refused(key: Any) -> None:
 
 
 def test_a_head_of_the_wrong_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"reward_model must write rewards of shape .*1\), got .*2\)"):
+    with pytest.raises(ValueError, match=r"reward_model must write reward of shape .*1\), got .*2\)"):
         RewardLoss(make_model(), make_head(2))(make_windows(4, 6))
 
 

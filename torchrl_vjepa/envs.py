@@ -20,7 +20,7 @@ from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
-from torchrl_vjepa.imagination import Tasks, densities, drawn, imagine, imagine_fused
+from torchrl_vjepa.imagination import Tasks, check_device, densities, drawn, imagine, imagine_fused
 from torchrl_vjepa.latent_step import LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
@@ -70,6 +70,13 @@ class LatentEnv(ModelBasedEnvBase):
         prior: of the task; its energy is subtracted from the reward. Of ``reward_model``, ``cost`` and
             ``prior`` at least one must be given; what is given is added up.
         fusion: how the prior enters the cost of a plan; all but ``"energy"`` need sampled trajectories.
+        termination_model: TensorDictModule that reads ``latent_key`` (the next latent) and ``action_key`` and
+            writes ``"termination_logit"`` of shape ``(*B, 1)``, the logit of the episode's end
+            (:class:`~torchrl_vjepa.objectives.TerminationLoss` trains it). Costs of a plan count as far as it
+            lives, :math:`\sum_k \prod_{j<k} (1 - p_j)\,(c_k + p_k c_{\text{end}})`, and a step writes
+            ``terminated`` and ``done``.
+        termination_cost: :math:`c_{\text{end}}`, what an end costs: where costs are positive, ending would
+            otherwise be a way to save them.
         how: the next latent: ``"mean"``, ``"mode"`` or ``"sample"``.
         num_samples: trajectories ``M`` per candidate plan for ``how="sample"`` (1 by default), or from ``M``
             particles of a belief with any ``how`` (64 by default). They share their
@@ -126,6 +133,8 @@ class LatentEnv(ModelBasedEnvBase):
         cost: StageCost | None = None,
         prior: Prior | None = None,
         fusion: Literal["energy", "weight", "propose"] = "energy",
+        termination_model: TensorDictModuleBase | None = None,
+        termination_cost: float = 0.0,
         how: Literal["mean", "mode", "sample"] = "mean",
         num_samples: int | None = None,
         risk: Risk | None = None,
@@ -178,6 +187,7 @@ class LatentEnv(ModelBasedEnvBase):
         world_model = LatentStep(
             predictor, transition, reward_model, cost, how, codec.shape,
             latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key), prior=prior,
+            termination_model=termination_model, termination_cost=termination_cost,
         )  # fmt: skip
         prior_dim = getattr(prior, "latent_dim", None)
         if prior_dim not in (None, latent_dim):
@@ -187,6 +197,7 @@ class LatentEnv(ModelBasedEnvBase):
             device = "cpu" if parameter is None else parameter.device
         if dtype is None:
             dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
+        check_device(prior, torch.device(device))
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
         self.codec = codec.to(self.device)
         self.latent_dim, self.action_dim = latent_dim, action_dim
@@ -358,7 +369,7 @@ class LatentEnv(ModelBasedEnvBase):
                 world_model.transition, start, actions, self._following(state, settings), generator
             )
             costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-        costs = costs.sum(dim=-1)
+        costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
         if settings.num_samples is None:
             return costs
         return plan_cost(costs, settings.risk, settings.constraints, latents, actions)

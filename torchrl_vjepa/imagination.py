@@ -14,9 +14,31 @@ from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
 from torchrl_vjepa.fusion import fuse
 from torchrl_vjepa.priors import LatentDensity, Prior
 
-__all__ = ["Tasks", "densities", "drawn", "imagine", "imagine_fused"]
+__all__ = ["Tasks", "check_device", "densities", "drawn", "imagine", "imagine_fused"]
 
 Tasks = Mapping[NestedKey, Tensor]
+
+
+def check_device(prior: Prior | None, device: torch.device) -> None:
+    """Refuse a prior that lives elsewhere than the model.
+
+    Args:
+        prior: the prior, if there is one.
+        device: of the model.
+
+    Raises:
+        ValueError: if a parameter or buffer of the prior is on another device.
+
+    Examples:
+        >>> from torchrl_vjepa import GaussianPrior
+        >>> check_device(GaussianPrior(2), torch.device("cpu"))
+    """
+    for tensor in () if prior is None else (*prior.parameters(), *prior.buffers()):
+        if tensor.device.type != device.type or device.index not in (None, tensor.device.index):
+            raise ValueError(
+                f"prior must be on the device of the model, {device}, got {tensor.device}; move it with "
+                "prior.to(device)"
+            )
 
 
 def densities(prior: Prior, tasks: Tasks | None, time_dim: int) -> Callable[[int], LatentDensity]:

@@ -33,6 +33,9 @@ class LatentStep(TensorDictModuleBase):
         action_key: where the action is.
         reward_key: where the reward is written.
         prior: its energy of the next latent is a cost; its tasks are read from the input.
+        termination_model: reads next latent and action, writes the logit of an end; or ``None``.
+        termination_key: the logit's entry.
+        termination_cost: what an end costs.
 
     Raises:
         TypeError: if the reward model is no TensorDictModule or the prior no Prior.
@@ -66,6 +69,9 @@ class LatentStep(TensorDictModuleBase):
         action_key: NestedKey,
         reward_key: NestedKey,
         prior: Prior | None = None,
+        termination_model: TensorDictModuleBase | None = None,
+        termination_key: NestedKey = "termination_logit",
+        termination_cost: float = 0.0,
     ) -> None:
         super().__init__()
         self.predictor = predictor  # registered: its parameters move and synchronise with the env
@@ -86,24 +92,28 @@ class LatentStep(TensorDictModuleBase):
         self.in_keys = [self.latent_key, self.action_key]
         self.out_keys = [self.latent_key, self.reward_key]
         self.reward_calls_tensors = False
-        if reward_model is not None:
-            if not isinstance(reward_model, TensorDictModuleBase):
-                raise TypeError(
-                    "reward_model must be a TensorDictModule, for instance TensorDictModule("
-                    "QuadraticReward(D, A), ['latent', 'action'], ['reward']), got "
-                    f"{type(reward_model).__name__}"
-                )
-            reads = [unravel_key(key) for key in reward_model.in_keys]
-            if not set(reads) <= set(self.in_keys):
-                raise KeyError(
-                    f"reward_model must read only latent_key={self.latent_key!r} and "
-                    f"action_key={self.action_key!r}, got in_keys={reads}; rename its in_keys"
-                )
-            if self.reward_key not in [unravel_key(key) for key in reward_model.out_keys]:
-                raise KeyError(
-                    f"reward_model must write reward_key={self.reward_key!r}, "
-                    f"got out_keys={list(reward_model.out_keys)}"
-                )
+        self.termination_model: Any = termination_model
+        self.termination_key, self.termination_cost = unravel_key(termination_key), termination_cost
+        example = "TensorDictModule(QuadraticReward(D, A), ['latent', 'action'], ['reward'])"
+        self._check_head("reward_model", reward_model, self.reward_key, example)
+        example = "TensorDictModule(nn.Linear(D, 1), ['latent'], ['termination_logit'])"
+        self._check_head("termination_model", termination_model, self.termination_key, example)
+
+    def _check_head(self, name: str, head: Any, written: NestedKey, example: str) -> None:
+        if head is None:
+            return
+        if not isinstance(head, TensorDictModuleBase):
+            raise TypeError(
+                f"{name} must be a TensorDictModule, for instance {example}, got {type(head).__name__}"
+            )
+        reads = [unravel_key(key) for key in head.in_keys]
+        if not set(reads) <= set(self.in_keys):
+            raise KeyError(
+                f"{name} must read only latent_key={self.latent_key!r} and "
+                f"action_key={self.action_key!r}, got in_keys={reads}; rename its in_keys"
+            )
+        if written not in [unravel_key(key) for key in head.out_keys]:
+            raise KeyError(f"{name} must write {written!r}, got out_keys={list(head.out_keys)}")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the next latent and the reward.
@@ -138,8 +148,16 @@ class LatentStep(TensorDictModuleBase):
             ndim = tensordict.batch_dims
             task = {k: v.squeeze(ndim) for k, v in self.prior.along(tensordict, ndim, 1).items()}
             out.update(self.prior.advanced(tensordict, ndim))
-        reward = -self.stage_cost(latent, action, task).unsqueeze(-1)
-        return out.set(self.latent_key, latent).set(self.reward_key, reward)
+        cost = self.stage_cost(latent, action, task)
+        if self.termination_model is not None:
+            probability = self.termination_probability(latent, action)
+            draw = torch.full_like(probability, 0.5)
+            if self.how == "sample":
+                draw.uniform_(generator=generator)
+            end = probability > draw
+            cost = cost + self.termination_cost * end
+            out.set("terminated", end.unsqueeze(-1)).set("done", end.unsqueeze(-1))
+        return out.set(self.latent_key, latent).set(self.reward_key, -cost.unsqueeze(-1))
 
     def stage_cost(self, latent: Tensor, action: Tensor, task: Task = None) -> Tensor:
         """Costs of next latents and the actions that led there, all at once.
@@ -182,13 +200,49 @@ class LatentStep(TensorDictModuleBase):
         reward = self._reward(latent, action)
         return -reward if total is None else total - reward
 
+    def termination_probability(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Probability that the episode ends with a step.
+
+        Args:
+            latent: next latents, of shape ``(*B, D)``.
+            action: flat, of shape ``(*B, A)``.
+
+        Returns:
+            Of shape ``(*B)``.
+
+        Raises:
+            ValueError: if the termination model returns another shape.
+        """
+        batch = latent.shape[:-1]
+        shaped = action.reshape((*batch, *self.action_shape))
+        logit = self._of_tensordict(self.termination_model, latent, shaped, self.termination_key)
+        return _checked_shape(logit, (*batch, 1), "termination_model").squeeze(-1).sigmoid()
+
+    def until_end(self, costs: Tensor, latent: Tensor, action: Tensor) -> Tensor:
+        r"""Costs as far as an episode lives, :math:`\prod_{j<k} (1 - p_j) \, (c_k + p_k c_{\text{end}})`.
+
+        Args:
+            costs: :math:`c_k`, of shape ``(*B, H)``.
+            latent: next latents, of shape ``(*B, H, D)``.
+            action: flat, of shape ``(*B, H, A)``.
+
+        Returns:
+            Of shape ``(*B, H)``; the costs themselves where there is no termination model.
+        """
+        if self.termination_model is None:
+            return costs
+        probability = self.termination_probability(latent, action)
+        alive = (1 - probability).cumprod(dim=-1)
+        alive = torch.cat([torch.ones_like(alive[..., :1]), alive[..., :-1]], dim=-1)
+        return alive * (costs + probability * self.termination_cost)
+
     def _reward(self, latent: Tensor, action: Tensor) -> Tensor:
         batch = latent.shape[:-1]
         shaped = action.reshape((*batch, *self.action_shape))
         if self.reward_calls_tensors:
             reward = self._reward_of_tensors(latent, shaped)
         else:
-            reward = self._reward_of_tensordict(latent, shaped)
+            reward = self._of_tensordict(self.reward_model, latent, shaped, self.reward_key)
         return _checked_shape(reward, (*batch, 1), "reward_model").squeeze(-1)
 
     def probe(
@@ -238,6 +292,8 @@ class LatentStep(TensorDictModuleBase):
         if self.prior is not None and not self.prior.in_keys:  # else there is no task to try it with
             self.stage_cost(latent, action)
         self.own_cost(latent, action)
+        if self.termination_model is not None:
+            self.termination_probability(latent, action)
         model = self.reward_model
         first = torch.empty(0) if model is None else self._reward(latent, action)
         if (
@@ -257,10 +313,10 @@ class LatentStep(TensorDictModuleBase):
         inputs = {self.latent_key: latent, self.action_key: action}
         return model.module(*(inputs[unravel_key(key)] for key in model.in_keys))
 
-    def _reward_of_tensordict(self, latent: Tensor, action: Tensor) -> Tensor:
+    def _of_tensordict(self, head: Any, latent: Tensor, action: Tensor, key: NestedKey) -> Any:
         inputs = TensorDict({}, batch_size=latent.shape[:-1], device=latent.device)
         inputs.set(self.latent_key, latent).set(self.action_key, action)
-        return self.reward_model(inputs).get(self.reward_key)
+        return head(inputs).get(key)
 
 
 def _checked_shape(value: Tensor, expected: tuple[int, ...], name: str) -> Tensor:
@@ -268,6 +324,6 @@ def _checked_shape(value: Tensor, expected: tuple[int, ...], name: str) -> Tenso
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(
             f"{name} must return a tensor of shape {tuple(expected)} for the batch "
-            f"{tuple(expected)[: None if name != 'reward_model' else -1]}, got {got}"
+            f"{tuple(expected)[: -1 if name.endswith('model') else None]}, got {got}"
         )
     return value

@@ -263,6 +263,8 @@ def known_product(
         >>> product.variance, rest(torch.ones(2))
         (tensor([0.5000, 0.5000]), tensor(-2.))
     """
+    if isinstance(prior, Density) and prior.is_flat:
+        return p, None, None
     _check_experts(p, prior)
     base = prior.base if isinstance(prior, Density) else prior
     if base is not None and has_closed_form(p, base):

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule, TensorDictParams, dispatch
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from torchrl_vjepa.objectives.blueprint import blueprint
 from torchrl_vjepa.objectives.pairs import mean_over, normalised_weights
 from torchrl_vjepa.stacking import features_first
 from torchrl_vjepa.windows import check_finite, pair_mask, read, step_mask, with_action_code
@@ -143,7 +144,7 @@ class WindowLoss(LossModule):
             )
         if len({id(m) for m in models}) != len(models):
             raise ValueError("model must be a list of distinct models, got the same one twice; build each")
-        blueprints = [_blueprint(m) for m in models if len(models) > 1]
+        blueprints = [blueprint(m) for m in models if len(models) > 1]
         for i, other in enumerate(blueprints):
             different = sorted(
                 key for key in blueprints[0] | other if blueprints[0].get(key) != other.get(key)
@@ -387,13 +388,17 @@ class WindowLoss(LossModule):
             )
         lead = (batch[0],) if self.stacked_data else ()
         shape = (*lead, -1, batch[-1])
+        dtypes = (value.dtype for value in entries.values() if value.is_floating_point())
+        floating = next(dtypes, torch.get_default_dtype())
         for key, value in entries.items():
             if value.shape[: len(batch)] != batch or value.ndim == len(batch):
                 raise ValueError(
                     f"{key!r} must have shape {(*batch, '...')} like {required[-1]!r}, "
                     f"got {tuple(value.shape)}"
                 )
-            if not value.is_floating_point():
+            if value.dtype == torch.bool:  # flags and one-hot actions
+                entries[key] = value.to(floating)
+            elif not value.is_floating_point():
                 raise ValueError(
                     f"{key!r} must be floating point, got {value.dtype}; convert it first "
                     "(ToTensorImage, DoubleToFloat, or ActionEncoder for multi-categorical actions)"
@@ -489,20 +494,3 @@ class WindowLoss(LossModule):
             return values[0]
         first, *rest = (w * value for w, value in zip(self.skip_weights, values, strict=True))
         return sum(rest, first)
-
-
-def _blueprint(model: torch.nn.Module) -> dict[str, Any]:
-    """What models must share to train as one batch: modules, their settings, shapes of their tensors."""
-    learned = dict(model.named_parameters())
-    blueprint: dict[str, Any] = {
-        f"{name} (tensor)": (tuple(value.shape), "learned" if name in learned else "fixed")
-        for name, value in model.state_dict().items()
-    }
-    for name, module in model.named_modules():
-        blueprint[name] = type(module).__name__
-        for key, value in vars(module).items():
-            # Not where a scale starts: that is a value of the tensor.
-            plain = isinstance(value, (bool, int, float, str, tuple, type(None)))
-            if plain and not key.startswith("_") and key not in ("training", "init_std"):
-                blueprint[f"{name}.{key}" if name else key] = value
-    return blueprint

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from torchrl_vjepa.distributions import Density, GaussianFactor, point_estimate
-from torchrl_vjepa.fusion import Fusion, fuse
+from torchrl_vjepa.fusion import Fusion, fuse, known_product
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.predictor.model import PredictiveModel
 from torchrl_vjepa.predictor.predictor import Predictor
@@ -117,7 +117,11 @@ class FusedPredictor(PredictiveModel):
         Returns:
             Distribution with batch ``*B`` and event ``(D,)``.
         """
-        return self.fuse(latent, action, skip=skip, side_info=side_info, task=task).posterior
+        p = self.predictor.dist(latent, action, skip=skip, side_info=side_info)
+        density = self._density(task)
+        # Planners call this at every step: the evidence, which costs three densities, is not needed.
+        product, _, rest = known_product(p, density)
+        return product if rest is None else self._fuse(p, density, self.generator, False).posterior
 
     def fuse(
         self,
@@ -148,13 +152,8 @@ class FusedPredictor(PredictiveModel):
             ValueError: if a task is given to a prior that takes none.
         """
         p = self.predictor.dist(latent, action, skip=skip, side_info=side_info)
-        return fuse(
-            p,
-            self._density(task),
-            num_particles=self.num_particles,
-            generator=self.generator if generator is None else generator,
-            shared_noise=shared_noise,
-        )
+        generator = self.generator if generator is None else generator
+        return self._fuse(p, self._density(task), generator, shared_noise)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the one-step point prediction, and what ``return_stats`` adds.
@@ -187,6 +186,13 @@ class FusedPredictor(PredictiveModel):
             tasks = self.prior.along(tensordict, batch_ndim, horizon=1)
             inputs["task"] = {key: value.select(batch_ndim, 0) for key, value in tasks.items()}
         return inputs
+
+    def _fuse(
+        self, p: Distribution, prior: LatentDensity, generator: torch.Generator | None, shared_noise: bool
+    ) -> Fusion:
+        return fuse(
+            p, prior, num_particles=self.num_particles, generator=generator, shared_noise=shared_noise
+        )
 
     def _density(self, task: Task) -> LatentDensity:
         if isinstance(self.prior, Prior):
