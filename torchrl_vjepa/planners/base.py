@@ -5,8 +5,9 @@ from __future__ import annotations
 import abc
 import math
 import warnings
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -36,6 +37,8 @@ class Plan(NamedTuple):
         best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
         best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite, at least
             :data:`~torchrl_vjepa.risk.REJECTED_COST` where no plan satisfied the chance constraints.
+        statistics: what else a search has to tell, one entry with batch ``*B`` for each name in
+            ``own_statistics`` of its planner.
 
     Examples:
         >>> import torch
@@ -48,6 +51,7 @@ class Plan(NamedTuple):
     std: Tensor
     best: Tensor
     best_cost: Tensor
+    statistics: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class Planner(MPCPlannerBase):
@@ -144,6 +148,9 @@ class Planner(MPCPlannerBase):
         tensor([0.5000])
     """
 
+    #: Names of :attr:`Plan.statistics`, which ``return_stats`` writes too.
+    own_statistics: ClassVar[tuple[str, ...]] = ()
+
     def __init__(
         self,
         env: EnvBase,
@@ -199,6 +206,7 @@ class Planner(MPCPlannerBase):
             writes.append(unravel_key(("next", self.plan_key)))
         if return_stats:
             names = ["actions", "std", "cost", *(["violation"] if self._constrained else [])]
+            names += self.own_statistics
             writes += [("plan_stats", name) for name in names]
         self.in_keys, self.out_keys = reads, writes
         if generator is None:
@@ -299,6 +307,7 @@ class Planner(MPCPlannerBase):
             if self.return_stats:
                 written += [self._shaped(plan.actions), self._shaped(plan.std)]
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
+                written += [plan.statistics[name] for name in self.own_statistics]
         return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
 
     @abc.abstractmethod
