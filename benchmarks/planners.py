@@ -55,7 +55,7 @@ PLANNERS = (
 )
 BOUND, EFFORT = 2.0, 0.1
 #: Multiplications of one plan beyond which a combination is left out: minutes, and nothing new.
-MAX_PRODUCTS = 1.5e11
+MAX_PRODUCTS = 2.5e11
 #: Iterations after which plans of different planners are compared: the optimum, not how soon it is reached.
 CONVERGED = 12
 
