@@ -8,7 +8,7 @@ better. :class:`LatentEnv` answers both on plain tensors.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
+from torchrl_vjepa.belief import PreparedTransition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.imagination import Tasks, densities, drawn, imagine, imagine_fused
@@ -341,23 +342,43 @@ class LatentEnv(ModelBasedEnvBase):
         Raises:
             ValueError: if a shape does not fit, or what is asked for needs samples and has none.
         """
-        settings = self.sampling(num_samples, risk, constraints, fusion)
-        start, actions = self._start(state, actions, settings.num_samples, generator)
+        evaluate = self.objective_from(
+            state, num_samples=num_samples, risk=risk, constraints=constraints, fusion=fusion
+        )
+        return evaluate(actions, generator)
+
+    def objective_from(
+        self, state: Tensor | TensorDictBase, **settings: Any
+    ) -> Callable[[Tensor, torch.Generator | None], Tensor]:
+        """:meth:`objective` of one planning call: what its rounds share is checked and prepared once.
+
+        Args:
+            state: see :meth:`objective`.
+            **settings: ``num_samples``, ``risk``, ``constraints``, ``fusion``; see :meth:`objective`.
+
+        Returns:
+            ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes.
+        """
+        given = self.sampling(**settings)
         world_model = self.world_model
-        if settings.fusion == "propose":
-            prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
-            latents, evidence = imagine_fused(world_model.transition, start, actions, prior_at, generator)
-            own = world_model.own_cost(latents, actions)
-            costs = -evidence if own is None else own - evidence
-        else:
-            latents = imagine(
-                world_model.transition, start, actions, self._following(state, settings), generator
-            )
-            costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-        costs = costs.sum(dim=-1)
-        if settings.num_samples is None:
-            return costs
-        return plan_cost(costs, settings.risk, settings.constraints, latents, actions)
+        transition = PreparedTransition(world_model.transition)
+
+        def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+            start, actions = self._start(state, actions, given.num_samples, generator)
+            if given.fusion == "propose":
+                prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
+                latents, evidence = imagine_fused(transition, start, actions, prior_at, generator)
+                own = world_model.own_cost(latents, actions)
+                costs = -evidence if own is None else own - evidence
+            else:
+                latents = imagine(transition, start, actions, self._following(state, given), generator)
+                costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
+            costs = costs.sum(dim=-1)
+            if given.num_samples is None:
+                return costs
+            return plan_cost(costs, given.risk, given.constraints, latents, actions)
+
+        return evaluate
 
     def violation_probability(
         self,

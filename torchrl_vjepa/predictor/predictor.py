@@ -256,8 +256,8 @@ class Predictor(PredictiveModel):
         are off, activations work in place. :func:`~torchrl_vjepa.belief.rollout` iterates it.
 
         Args:
-            latent: an example of what it will be called with, of shape ``(*B, D)``.
-            action: likewise, of shape ``(*B, A)``.
+            latent: an example of what it will be called with, of shape ``(R, D)``.
+            action: likewise, of shape ``(R, A)``.
             dtype: what the network computes in, for instance ``torch.bfloat16``; latents come and go in
                 theirs. ``None``: the dtype of the weights.
 
@@ -292,31 +292,36 @@ class Predictor(PredictiveModel):
         layers = linear_and_others(trunk)
         if layers is None or layers[0].weight.ndim != 2:
             return None
-        joined = self.latent_dim + self.action_dim
-        constant = self.latent_dim + max(self.skips) * self.action_dim + index
-        steps = []
+        size, action_dim, residual = self.latent_dim, self.action_dim, self.residual
+        last = len(layers) - 1
+        steps: list[Callable[[Tensor], Tensor]] = []
         for place, layer in enumerate(layers):
             if not isinstance(layer, nn.Linear):
-                steps.append(layer)
+                hooked = layer._forward_hooks or layer._forward_pre_hooks
+                steps.append(layer if hooked else layer.forward)
                 continue
             weight, bias = layer.weight, layer.bias
             if place == 0 and self.trunk == "mlp":
-                bias = weight[:, constant] if bias is None else bias + weight[:, constant]
-                weight = weight[:, :joined]
-            if place == len(layers) - 1:
-                weight = weight[: self.latent_dim]
-                bias = None if bias is None else bias[: self.latent_dim]
+                constant = weight.select(1, size + max(self.skips) * action_dim + index)
+                bias = constant if bias is None else bias + constant
+                weight = weight.narrow(1, 0, size + action_dim)
+            if place == last and head.num_features(size) > size:
+                weight = weight.narrow(0, 0, size)
+                bias = None if bias is None else bias.narrow(0, 0, size)
+            bias = weight.new_zeros(()) if bias is None else bias
             if dtype is not None:
-                weight, bias = weight.to(dtype), None if bias is None else bias.to(dtype)
-            steps.append(functools.partial(F.linear, weight=weight, bias=bias))
+                weight, bias = weight.to(dtype), bias.to(dtype)
+            steps.append(functools.partial(torch.addmm, bias, mat2=weight.t()))
 
         def step(latent: Tensor, action: Tensor) -> Tensor:
-            x = torch.cat([latent, action], dim=-1) if self.action_dim else latent
-            x = x if dtype is None else x.to(dtype)
+            x = torch.cat([latent, action], dim=-1) if action_dim else latent
+            if dtype is not None:
+                x = x.to(dtype)
             for layer in steps:
                 x = layer(x)
-            x = x if dtype is None else x.to(latent.dtype)
-            return latent + x if self.residual else x
+            if dtype is not None:
+                x = x.to(latent.dtype)
+            return latent + x if residual else x
 
         return step
 
@@ -329,10 +334,11 @@ class Predictor(PredictiveModel):
         return self.skips.index(skip)
 
     def _check_dtype(self, *inputs: Tensor | None) -> None:
+        constants = self.constants
+        dtype = constants.dtype
         given = [item.dtype for item in inputs if item is not None]
-        dtype = self.constants.dtype
-        joined = functools.reduce(torch.promote_types, given)
-        if joined != dtype and not torch.is_autocast_enabled(self.constants.device.type):
+        fits = all(item == dtype for item in given) or functools.reduce(torch.promote_types, given) == dtype
+        if not fits and not torch.is_autocast_enabled(constants.device.type):
             raise TypeError(
                 f"latent, action and side_info must have the dtype of the predictor's weights, {dtype}, "
                 f"got {given}; cast them"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import torch
@@ -36,8 +35,9 @@ def linear_and_others(trunk: nn.Module) -> list[Any] | None:
     layers = list(trunk)
     if not (layers and is_plain_linear(layers[0]) and is_plain_linear(layers[-1])):
         return None
-    if any(isinstance(layer, nn.Linear) and not is_plain_linear(layer) for layer in layers):
-        return None
+    for layer in layers[1:-1]:
+        if isinstance(layer, nn.Linear) and not is_plain_linear(layer):
+            return None
     if torch.is_grad_enabled():
         return layers
     return [_in_place(layer) if getattr(layer, "inplace", None) is False else layer for layer in layers]
@@ -45,6 +45,6 @@ def linear_and_others(trunk: nn.Module) -> list[Any] | None:
 
 def _in_place(activation: nn.Module) -> nn.Module:
     """A copy that overwrites its input, which no one else holds behind an affine map."""
-    activation = copy.copy(activation)
-    activation.inplace = True  # type: ignore[assignment]
-    return activation
+    copied = object.__new__(type(activation))  # copy.copy takes five times as long
+    copied.__dict__.update(activation.__dict__, inplace=True)
+    return copied
