@@ -7,7 +7,7 @@ better. :class:`LatentEnv` answers both on plain tensors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -18,9 +18,10 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_vjepa.actions import ActionCodec
+from torchrl_vjepa.belief import PreparedTransition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
-from torchrl_vjepa.imagination import Tasks, check_device, densities, drawn, imagine, imagine_fused
+from torchrl_vjepa.imagination import Tasks, check_device, densities, first_latents, imagine, imagine_fused
 from torchrl_vjepa.latent_step import LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
@@ -356,23 +357,43 @@ class LatentEnv(ModelBasedEnvBase):
         Raises:
             ValueError: if a shape does not fit, or what is asked for needs samples and has none.
         """
-        settings = self.sampling(num_samples, risk, constraints, fusion)
-        start, actions = self._start(state, actions, settings.num_samples, generator)
+        evaluate = self.objective_from(
+            state, num_samples=num_samples, risk=risk, constraints=constraints, fusion=fusion
+        )
+        return evaluate(actions, generator)
+
+    def objective_from(
+        self, state: Tensor | TensorDictBase, **settings: Any
+    ) -> Callable[[Tensor, torch.Generator | None], Tensor]:
+        """:meth:`objective` of one planning call: what its rounds share is checked and prepared once.
+
+        Args:
+            state: see :meth:`objective`.
+            **settings: ``num_samples``, ``risk``, ``constraints``, ``fusion``; see :meth:`objective`.
+
+        Returns:
+            ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes.
+        """
+        given = self.sampling(**settings)
         world_model = self.world_model
-        if settings.fusion == "propose":
-            prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
-            latents, evidence = imagine_fused(world_model.transition, start, actions, prior_at, generator)
-            own = world_model.own_cost(latents, actions)
-            costs = -evidence if own is None else own - evidence
-        else:
-            latents = imagine(
-                world_model.transition, start, actions, self._following(state, settings), generator
-            )
-            costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-        costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
-        if settings.num_samples is None:
-            return costs
-        return plan_cost(costs, settings.risk, settings.constraints, latents, actions)
+        transition = PreparedTransition(world_model.transition)
+
+        def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+            start, actions = self._start(state, actions, given.num_samples, generator)
+            if given.fusion == "propose":
+                prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
+                latents, evidence = imagine_fused(transition, start, actions, prior_at, generator)
+                own = world_model.own_cost(latents, actions)
+                costs = -evidence if own is None else own - evidence
+            else:
+                latents = imagine(transition, start, actions, self._following(state, given), generator)
+                costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
+            costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
+            if given.num_samples is None:
+                return costs
+            return plan_cost(costs, given.risk, given.constraints, latents, actions)
+
+        return evaluate
 
     def violation_probability(
         self,
@@ -407,33 +428,11 @@ class LatentEnv(ModelBasedEnvBase):
         return torch.stack([constraint(latents, actions) for constraint in settings.constraints], dim=-1)
 
     def _start(
-        self,
-        state: Tensor | TensorDictBase,
-        actions: Tensor,
-        num_samples: int | None,
-        generator: torch.Generator | None,
+        self, state: Tensor | TensorDictBase, actions: Tensor, samples: int | None, rng: Any
     ) -> tuple[Tensor, Tensor]:
-        """First latents ``(*B, N, D)`` and actions ``(*B, N, H, A)``; with ``M`` in front where sampled."""
-        batch, (num_candidates, _, action_dim) = actions.shape[:-3], actions.shape[-3:]
-        if isinstance(state, Tensor):
-            if self.task_keys:
-                raise KeyError(f"state must hold the tasks {self.task_keys} under 'tasks', got a tensor")
-            start = state
-        elif self.belief_key is None:
-            start = state.get("latent")
-        else:
-            start = drawn(state, num_samples or 1, generator)
-        lead = self.belief_key is not None and not isinstance(state, Tensor)
-        if start.shape[lead:] != (*batch, self.latent_dim) or action_dim != self.action_dim:
-            raise ValueError(
-                f"state and actions must have shapes (*B, {self.latent_dim}) and (*B, N, H, "
-                f"{self.action_dim}), got {tuple(start.shape[lead:])} and {tuple(actions.shape)}"
-            )
-        actions = actions.to(start.dtype)
-        if num_samples is not None:
-            actions = actions.expand(num_samples, *actions.shape)
-            start = start if lead else start.expand(num_samples, *start.shape)
-        return start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim), actions
+        if isinstance(state, Tensor) and self.task_keys:
+            raise KeyError(f"state must hold the tasks {self.task_keys} under 'tasks', got a tensor")
+        return first_latents(state, actions, self.latent_dim, self.action_dim, samples, rng)
 
     def _following(
         self, state: Tensor | TensorDictBase, settings: Sampling

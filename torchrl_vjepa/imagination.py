@@ -14,7 +14,7 @@ from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
 from torchrl_vjepa.fusion import fuse
 from torchrl_vjepa.priors import LatentDensity, Prior
 
-__all__ = ["Tasks", "check_device", "densities", "drawn", "imagine", "imagine_fused"]
+__all__ = ["Tasks", "check_device", "densities", "drawn", "first_latents", "imagine", "imagine_fused"]
 
 Tasks = Mapping[NestedKey, Tensor]
 
@@ -93,6 +93,54 @@ def drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator |
     ).unsqueeze(-1)
     particles = belief.get("particles")
     return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
+
+
+def first_latents(
+    state: Tensor | TensorDictBase,
+    actions: Tensor,
+    latent_dim: int,
+    action_dim: int,
+    num_samples: int | None,
+    generator: torch.Generator | None,
+) -> tuple[Tensor, Tensor]:
+    """Where every candidate plan starts, and the plans, both with samples in front.
+
+    Args:
+        state: latents ``(*B, D)``, or what ``LatentEnv.planning_state`` gives.
+        actions: candidate plans, of shape ``(*B, N, H, A)``.
+        latent_dim: ``D``.
+        action_dim: ``A``.
+        num_samples: ``M``; ``None``: no dimension of samples.
+        generator: source of randomness, for beliefs.
+
+    Returns:
+        First latents ``(*B, N, D)`` and actions ``(*B, N, H, A)``; with ``M`` in front where sampled.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> start, actions = first_latents(torch.zeros(5, 2), torch.zeros(5, 7, 3, 1), 2, 1, 4, None)
+        >>> start.shape, actions.shape
+        (torch.Size([4, 5, 7, 2]), torch.Size([4, 5, 7, 3, 1]))
+    """
+    batch, num_candidates = actions.shape[:-3], actions.shape[-3]
+    lead = not isinstance(state, Tensor) and state.get("particles", None) is not None
+    if isinstance(state, Tensor):
+        start = state
+    else:
+        start = drawn(state, num_samples or 1, generator) if lead else state.get("latent")
+    if start.shape[lead:] != (*batch, latent_dim) or actions.shape[-1] != action_dim:
+        raise ValueError(
+            f"state and actions must have shapes (*B, {latent_dim}) and (*B, N, H, {action_dim}), got "
+            f"{tuple(start.shape[lead:])} and {tuple(actions.shape)}"
+        )
+    actions = actions.to(start.dtype)
+    if num_samples is not None:
+        actions = actions.expand(num_samples, *actions.shape)
+        start = start if lead else start.expand(num_samples, *start.shape)
+    return start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, latent_dim), actions
 
 
 def imagine(

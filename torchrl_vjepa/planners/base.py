@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -308,7 +308,10 @@ class Planner(MPCPlannerBase):
                 written += [self._shaped(plan.actions), self._shaped(plan.std)]
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
                 written += [plan.statistics[name] for name in self.own_statistics]
-        return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
+        out = tensordict if tensordict_out is None else tensordict_out
+        for key, value in zip(self.out_keys, written, strict=True):
+            out.set(key, value)
+        return out
 
     @abc.abstractmethod
     def plan(self, state: Any, proposal: Proposal) -> Plan:
@@ -331,7 +334,7 @@ class Planner(MPCPlannerBase):
         batch = state.shape[:-1] if isinstance(state, Tensor) else state.batch_size
         self._follow_device()
         plan = self.plan(state, self._start(tensordict, batch))
-        if not bool(plan.best_cost.isfinite().all()):
+        if not bool((plan.best_cost < math.inf).all()):
             warnings.warn(
                 "no candidate plan has a finite cost in at least one row: its action is the mean "
                 "of the proposal; check the model, the cost and the input for nan and inf",
@@ -394,12 +397,27 @@ class Planner(MPCPlannerBase):
         return statistics
 
     def _evaluate(self, state: Any, candidates: Tensor) -> Tensor:
+        return self._evaluator(state)(candidates)
+
+    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
+        """``candidates (*B, N, H, A) -> costs (*B, N)`` of one planning call, infinite where not finite."""
         names = "num_samples", "risk", "constraints", "fusion"
         asked = _given({name: getattr(self, name) for name in names})
-        generator = self._model_generator
-        costs = self._source.objective(state, candidates, generator=generator, **asked)
-        costs = costs.to(candidates.dtype)
-        return torch.where(costs.isfinite(), costs, math.inf)
+        source, generator = self._source, self._model_generator
+        # A subclass that gives another objective alone must be asked for that.
+        owner = next(cls for cls in type(source).__mro__ if "objective" in vars(cls))
+        if "objective_from" in vars(owner):
+            objective = source.objective_from(state, **asked)
+        else:
+
+            def objective(candidates: Tensor, generator: torch.Generator) -> Tensor:
+                return source.objective(state, candidates, generator=generator, **asked)
+
+        def evaluate(candidates: Tensor) -> Tensor:
+            costs = objective(candidates, generator)
+            return costs.to(candidates.dtype).nan_to_num(math.inf, math.inf, math.inf)
+
+        return evaluate
 
     def _shaped(self, actions: Tensor) -> Tensor:
         return actions.reshape((*actions.shape[:-1], *self.action_shape))

@@ -133,23 +133,26 @@ class SamplingPlanner(Planner):
         codec, family = self.codec, self.family
         best = codec.mode(proposal.mean)
         best_cost = best.new_full(best.shape[:-2], math.inf)
-        model_state = self._model_generator.get_state()
+        generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
+        model_state = generator.get_state()
+        evaluate = self._evaluator(state)
         for _ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
-            self._model_generator.set_state(model_state)
+            generator.set_state(model_state)
             candidates = self._candidates(proposal, best)
-            costs = self._evaluate(state, candidates)
-            elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
-            if self._constrained:
+            costs = evaluate(candidates)
+            elite_costs, index = costs.topk(top_k, dim=-1, largest=False)
+            if constrained:
                 feasible = elite_costs < REJECTED_COST
                 elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
-            index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
+            index = index.unsqueeze(-1).unsqueeze(-1).expand(*index.shape, *candidates.shape[-2:])
             elites = candidates.gather(-3, index)
-            found = elite_costs[..., 0].isfinite()[..., None, None]
-            better = elite_costs[..., 0] < best_cost
-            best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
-            best_cost = torch.where(better, elite_costs[..., 0], best_cost)
+            lowest = elite_costs.select(-1, 0)  # infinite where no cost is finite
+            better = (lowest < best_cost).unsqueeze(-1).unsqueeze(-1)
+            best = torch.where(better, elites.select(-3, 0), best)
+            best_cost = torch.minimum(lowest, best_cost)
             mean, std = self.update(proposal, elites, elite_costs)
+            found = (lowest < math.inf).unsqueeze(-1).unsqueeze(-1)
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
             proposal = family.confine(Proposal(mean, std), self.min_std)
@@ -157,7 +160,7 @@ class SamplingPlanner(Planner):
         if self._constrained and self.output == "mean":
             # The mean of feasible plans may be none (around an obstacle it lies in it).
             self._model_generator.set_state(model_state)
-            cost = self._evaluate(state, actions.unsqueeze(-3))[..., 0]
+            cost = evaluate(actions.unsqueeze(-3))[..., 0]
             worse = (cost >= REJECTED_COST) & (best_cost < cost)
             actions = torch.where(worse[..., None, None], best, actions)
         return Plan(actions, proposal.std, best, best_cost)
