@@ -10,13 +10,14 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Distribution
+from torchrl.data import Composite, TensorSpec
 
 from torchrl_vjepa.belief import Transition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.distributions import point_estimate
 from torchrl_vjepa.priors import Prior, Task
 
-__all__ = ["LatentStep"]
+__all__ = ["LatentStep", "single_leaf"]
 
 
 class LatentStep(TensorDictModuleBase):
@@ -261,6 +262,34 @@ class LatentStep(TensorDictModuleBase):
         inputs = TensorDict({}, batch_size=latent.shape[:-1], device=latent.device)
         inputs.set(self.latent_key, latent).set(self.action_key, action)
         return self.reward_model(inputs).get(self.reward_key)
+
+
+def single_leaf(spec: TensorSpec, action_key: NestedKey) -> TensorSpec:
+    """The specification of the action, also where it comes in a composite.
+
+    Args:
+        spec: one tensor, or a composite that holds it.
+        action_key: its entry.
+
+    Returns:
+        The specification of the tensor.
+
+    Raises:
+        TypeError: if the composite holds something else.
+
+    Examples:
+        >>> from torchrl.data import Unbounded
+        >>> single_leaf(Composite(action=Unbounded((2,))), "action").shape
+        torch.Size([2])
+    """
+    if not isinstance(spec, Composite):
+        return spec
+    leaves = [unravel_key(key) for key in spec.keys(True, True)]
+    if leaves != [unravel_key(action_key)]:
+        raise TypeError(
+            f"action_spec must be one tensor under action_key={action_key!r}, got the keys {leaves}"
+        )
+    return spec[leaves[0]]
 
 
 def _checked_shape(value: Tensor, expected: tuple[int, ...], name: str) -> Tensor:
