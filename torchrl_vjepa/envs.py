@@ -95,6 +95,8 @@ class LatentEnv(ModelBasedEnvBase):
         action_key: where the action is, if ``action_spec`` is no ``Composite``, and the name under which
             models read it; by default the model's, else ``"action"``.
         reward_key: where the reward is written.
+        rollout_dtype: what the network computes in while planning, for instance ``torch.bfloat16``; latents
+            and costs keep their dtype. Not for ``fusion="propose"``, which factorises covariances.
         device: by default the one of the model's parameters.
         dtype: of the latent; by default the one of the model's parameters.
 
@@ -145,6 +147,7 @@ class LatentEnv(ModelBasedEnvBase):
         belief_key: NestedKey | None = None,
         action_key: NestedKey | None = None,
         reward_key: NestedKey = "reward",
+        rollout_dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
@@ -152,6 +155,8 @@ class LatentEnv(ModelBasedEnvBase):
             raise ValueError("at least one of reward_model, cost and prior must be given, got none")
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
+        if rollout_dtype is not None and not rollout_dtype.is_floating_point:
+            raise ValueError(f"rollout_dtype must be a floating point dtype, got {rollout_dtype}")
         sampled = how == "sample" or belief_key is not None
         if num_samples is None:
             num_samples = 1 if belief_key is None else BELIEF_SAMPLES
@@ -212,6 +217,7 @@ class LatentEnv(ModelBasedEnvBase):
         self.how, self.num_samples, self.risk, self.fusion = how, num_samples, risk, fusion
         self.constraints: Any = nn.ModuleList(constraints)  # registered: their modules move along
         self.rng: torch.Generator | None = None
+        self.rollout_dtype = rollout_dtype
         latent_spec = Unbounded((latent_dim,), device=self.device, dtype=dtype)
         self.observation_spec = Composite({self.latent_key: latent_spec}, device=self.device)
         self.state_spec = Composite({self.latent_key: latent_spec.clone()}, device=self.device)
@@ -375,8 +381,10 @@ class LatentEnv(ModelBasedEnvBase):
             ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes.
         """
         given = self.sampling(**settings)
+        if given.fusion == "propose" and self.rollout_dtype is not None:
+            raise ValueError(f"rollout_dtype must be None for fusion='propose', got {self.rollout_dtype}")
         world_model = self.world_model
-        transition = PreparedTransition(world_model.transition)
+        transition = PreparedTransition(world_model.transition, self.rollout_dtype)
 
         def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
             start, actions = self._start(state, actions, given.num_samples, generator)
@@ -387,6 +395,7 @@ class LatentEnv(ModelBasedEnvBase):
                 costs = -evidence if own is None else own - evidence
             else:
                 latents = imagine(transition, start, actions, self._following(state, given), generator)
+                latents = latents.to(start.dtype)
                 costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
             costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
             if given.num_samples is None:

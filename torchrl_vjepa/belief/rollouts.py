@@ -144,6 +144,8 @@ class PreparedTransition:
 
     Args:
         transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
+        dtype: what networks compute in: a ``point_step`` by weights of that dtype, others by autocast;
+            ``None``: as they do without.
 
     Examples:
         >>> import torch
@@ -153,8 +155,8 @@ class PreparedTransition:
         torch.Size([7, 5, 4])
     """
 
-    def __init__(self, transition: Transition) -> None:
-        self.transition = transition
+    def __init__(self, transition: Transition, dtype: torch.dtype | None = None) -> None:
+        self.transition, self.dtype = transition, dtype
         self._step: PointStep | None = None
         self._example: tuple[Any, ...] | None = None
 
@@ -173,7 +175,10 @@ class PreparedTransition:
         Returns:
             What the transition returns.
         """
-        return self.transition(latent, action)
+        if self.dtype is None:
+            return self.transition(latent, action)
+        with torch.autocast(latent.device.type, self.dtype):
+            return self.transition(latent, action)
 
     def point_step(self, latent: Tensor, actions: Tensor) -> PointStep | None:
         """The short way to mean and mode, where the owner of the transition knows one.
@@ -192,7 +197,7 @@ class PreparedTransition:
             self._step = None
             if prepare is not None and self.transition == getattr(owner, "dist", None):
                 rows = latent.reshape(-1, latent.shape[-1])[:1]
-                self._step = prepare(rows, actions.reshape(-1, actions.shape[-1])[:1])
+                self._step = prepare(rows, actions.reshape(-1, actions.shape[-1])[:1], self.dtype)
             self._example = example
         return self._step
 

@@ -106,6 +106,9 @@ class Planner(MPCPlannerBase):
         fusion: how the environment's prior enters the cost of a plan: as an ``"energy"``, or by posterior
             (``"weight"``, ``"propose"``; see :class:`~torchrl_vjepa.envs.LatentEnv`); the environment's by
             default.
+        compile: call the objective through ``torch.compile``, with these options (``{"mode":
+            "reduce-overhead"}`` are CUDA graphs on a GPU). The first call, and the first of each new batch
+            size, takes long.
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
             (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
             there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
@@ -165,6 +168,7 @@ class Planner(MPCPlannerBase):
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: Literal["energy", "weight", "propose"] | None = None,
+        compile: bool | Mapping[str, Any] = False,
         return_stats: bool = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
@@ -195,6 +199,8 @@ class Planner(MPCPlannerBase):
         self.num_samples, self.risk, self.fusion = num_samples, risk, fusion
         self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
+        self.compile_options = None if compile is False else {} if compile is True else dict(compile)
+        self._compiled: Callable[..., Tensor] | None = None
         self.warm_start, self.warm_std, self.return_stats = warm_start, warm_std, return_stats
         self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
         self.action_shape = tuple(codec.shape)
@@ -406,12 +412,12 @@ class Planner(MPCPlannerBase):
         source, generator = self._source, self._model_generator
         # A subclass that gives another objective alone must be asked for that.
         owner = next(cls for cls in type(source).__mro__ if "objective" in vars(cls))
-        if "objective_from" in vars(owner):
+        if self.compile_options is None and "objective_from" in vars(owner):
             objective = source.objective_from(state, **asked)
         else:
 
             def objective(candidates: Tensor, generator: torch.Generator) -> Tensor:
-                return source.objective(state, candidates, generator=generator, **asked)
+                return self._called(source.objective, state, candidates, generator=generator, **asked)
 
         def evaluate(candidates: Tensor) -> Tensor:
             costs = objective(candidates, generator)
@@ -419,12 +425,26 @@ class Planner(MPCPlannerBase):
 
         return evaluate
 
+    def _called(self, objective: Callable[..., Tensor], *args: Any, **kwargs: Any) -> Tensor:
+        """The objective's answer, compiled if that was asked for."""
+        if self.compile_options is None:
+            return objective(*args, **kwargs)
+        if self._compiled is None:
+            self._compiled = torch.compile(objective, **self.compile_options)
+        try:
+            return self._compiled(*args, **kwargs)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            raise RuntimeError(
+                f"compile must be False for the objective of {type(self.env).__name__} on this machine: "
+                f"torch.compile failed with {type(error).__name__}: {error}"
+            ) from error
+
     def _shaped(self, actions: Tensor) -> Tensor:
         return actions.reshape((*actions.shape[:-1], *self.action_shape))
 
     def __getstate__(self) -> dict[str, Any]:
         packed = {name: pack_generator(self.__dict__[name]) for name in _GENERATORS}
-        return {**super().__getstate__(), **packed}
+        return {**super().__getstate__(), **packed, "_compiled": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         unpacked = {name: unpack_generator(state[name]) for name in _GENERATORS}

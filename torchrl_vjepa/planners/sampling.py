@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import abc
 import math
+import time
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -46,6 +48,12 @@ class SamplingPlanner(Planner):
         min_std: floor under the spread, as a fraction of the one after a cold start; for discrete actions,
             the weight of the uniform distribution in the proposal.
         antithetic: draw noise in pairs of opposite sign.
+        chunk_size: candidates (of every row) that are imagined at a time; all by default. The memory of a
+            round is then that of ``chunk_size`` candidates; the plan is the same up to rounding, except in
+            environments that draw their own noise.
+        max_ms: time for a plan, in milliseconds: no round begins that would end later, if it took as long as
+            the longest before it. The first always runs; the plan is that of the rounds that did. Waits for
+            the device after each round, and how far planning gets depends on the machine and the batch size.
         output: the plan is the ``"mean"`` of the proposal (where actions are discrete its most probable
             plan), or the ``"best"`` candidate seen.
         **kwargs: see :class:`Planner`.
@@ -89,6 +97,8 @@ class SamplingPlanner(Planner):
         *,
         min_std: float = 0.01,
         antithetic: bool = True,
+        chunk_size: int | None = None,
+        max_ms: float | None = None,
         output: Literal["mean", "best"] = "mean",
         **kwargs: Any,
     ) -> None:
@@ -101,7 +111,12 @@ class SamplingPlanner(Planner):
             raise ValueError(f"min_std must be in (0, 1], got {min_std}")
         if output not in ("mean", "best"):
             raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
+        if chunk_size is not None:
+            check_counts(chunk_size=chunk_size)
+        if max_ms is not None and not 0 < max_ms < math.inf:
+            raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
 
@@ -136,6 +151,7 @@ class SamplingPlanner(Planner):
         generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
+        clock = None if self.max_ms is None else _Clock(self.max_ms)
         for _ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
             generator.set_state(model_state)
@@ -156,6 +172,8 @@ class SamplingPlanner(Planner):
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
             proposal = family.confine(Proposal(mean, std), self.min_std)
+            if clock is not None and not clock.another(best_cost):
+                break
         actions = codec.mode(proposal.mean) if self.output == "mean" else best
         if self._constrained and self.output == "mean":
             # The mean of feasible plans may be none (around an obstacle it lies in it).
@@ -164,6 +182,21 @@ class SamplingPlanner(Planner):
             worse = (cost >= REJECTED_COST) & (best_cost < cost)
             actions = torch.where(worse[..., None, None], best, actions)
         return Plan(actions, proposal.std, best, best_cost)
+
+    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
+        evaluate, size, generator = super()._evaluator(state), self.chunk_size, self._model_generator
+        if size is None:
+            return evaluate
+
+        def in_chunks(candidates: Tensor) -> Tensor:
+            noise = generator.get_state()
+            costs = []
+            for chunk in candidates.split(size, dim=-3):
+                generator.set_state(noise)  # common to all candidates
+                costs.append(evaluate(chunk))
+            return torch.cat(costs, dim=-1)
+
+        return in_chunks
 
     def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
@@ -184,3 +217,19 @@ class SamplingPlanner(Planner):
         if num > 2:
             candidates[..., 1, :, :] = best
         return candidates
+
+
+class _Clock:
+    """Whether there is time for another round."""
+
+    def __init__(self, max_ms: float) -> None:
+        self.last = time.perf_counter()
+        self.end = self.last + 1e-3 * max_ms
+        self.longest = 0.0
+
+    def another(self, result: Tensor) -> bool:
+        """Count one round, which ends when its result is there."""
+        result.sum().item()
+        now = time.perf_counter()
+        self.longest, self.last = max(self.longest, now - self.last), now
+        return now + self.longest <= self.end
