@@ -1,8 +1,8 @@
 """Swing up Gymnasium's Pendulum-v1: collect with the planner, train VJEPA, repeat.
 
-The first two episodes are random. In each round VJEPA learns from a replay buffer how latents move, a reward
+The first five episodes are random. In each round VJEPA learns from a replay buffer how latents move, a reward
 head learns what a step pays, and MPPI plans in the model: twenty evaluation episodes, the same in every round
-and for every seed, and two more episodes for the buffer. The table and the figure say what the evaluation
+and for every seed, and five more episodes for the buffer. The table and the figure say what the evaluation
 episodes return after each round, next to the same planner with the true model, and to random actions.
 
 With --checkpoint FILE every round is saved. The same command, started again, continues after the last saved
@@ -69,8 +69,8 @@ class Settings:
     """What the run does; every field is a command-line option."""
 
     seeds: list[int] = option([0], "each seed makes the networks, the data and the training")
-    env_steps: int = option(4_000, "environment steps in all, random ones and those of the planner")
-    collect_episodes: int = option(2, "episodes of 200 steps collected in a round, at once")
+    env_steps: int = option(10_000, "environment steps in all, random ones and those of the planner")
+    collect_episodes: int = option(5, "episodes of 200 steps collected in a round, at once")
     latent_dim: int = option(3, "size of the latent")
     num_cells: int = option(64, "width of the two hidden layers of the predictor and of the reward head")
     train_steps: int = option(1_000, "optimiser steps in a round")
