@@ -107,6 +107,7 @@ def rollout(num_episodes: int, seed: int, policy: Any = None) -> TensorDict:
         for transform in get_env_transforms_from_module(policy):
             env.append_transform(transform)
     env.set_seed(seed)
+    torch.manual_seed(seed)  # of random actions
     with torch.no_grad():
         data = env.rollout(EPISODE, policy)
     env.close()

@@ -67,6 +67,13 @@ def test_actions_are_gymnasiums(pendulum: Any) -> None:
     assert space.high == pendulum.ACTIONS.space.high.numpy()
 
 
+def test_a_rollout_depends_on_its_seed_alone(pendulum: Any) -> None:
+    one, again, other = (pendulum.rollout(2, seed) for seed in (0, 0, 1))
+    for key in ("observation", "action", ("next", "reward")):
+        assert torch.equal(one[key], again[key])
+        assert not torch.equal(one[key], other[key])
+
+
 def test_one_row_for_each_round_in_order(pendulum: Any, uninterrupted: dict[str, Any]) -> None:
     cells = [(row["seed"], row["env_steps"]) for row in uninterrupted["rows"]]
     assert cells == [(seed, steps) for seed in (3, 4) for steps in (30, 60, 90)]
@@ -164,7 +171,9 @@ def test_a_damaged_checkpoint_is_refused(
     )
     before = path.read_bytes()
     with pytest.raises(SystemExit):
-        pendulum.main(["--quick", "--out", str(tmp_path / "figures"), "--checkpoint", str(path)])
+        pendulum.main(
+            ["--quick", "--env-steps", "300", "--out", str(tmp_path / "figures"), "--checkpoint", str(path)]
+        )
     assert "damaged" in capsys.readouterr().err
     assert path.read_bytes() == before, "what is refused is not overwritten"
 
@@ -181,7 +190,7 @@ def test_a_checkpoint_of_other_settings_is_refused(pendulum: Any, tmp_path: Path
     [
         (["--env-steps", "500"], "multiple"),
         (["--env-steps", "0"], "multiple"),
-        (["--seeds", "1", "1"], "distinct"),
+        (["--env-steps", "300", "--seeds", "1", "1"], "distinct"),
     ],
 )
 def test_the_command_line_refuses(
