@@ -95,7 +95,7 @@ QUICK = {
     "planning_horizon": 8,
     "optim_steps": 1,
     "num_candidates": 16,
-    "episodes": 4,
+    "episodes": 2,
 }
 
 
