@@ -373,7 +373,7 @@ def figure(rows: Sequence[Row], known: Sequence[Row], path: Path) -> None:
             ax.axhline(row["return_mean"], label=REFERENCES[row["policy"]], lw=1.5, **STYLES[row["policy"]])
         ax.axhline(GOAL, color="0.5", ls=":", lw=1.2, label=f"goal: {GOAL:g}")
         ax.set_xlabel("environment steps")
-    axes[0].set(ylabel="mean return of an episode", title="Every evaluation")
+    axes[0].set(ylabel="mean return\n(sum of 200 rewards)", title="All evaluations")
     true = known[0]["return_mean"]
     axes[1].set(title="Near the true model", ylim=(true - 100.0, true + 15.0))
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
@@ -403,12 +403,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
     # The tensors are small: more threads would only wait for each other.
     torch.set_num_threads(1)
-    try:
-        result = run_seeds(settings, args.checkpoint)
-    except ValueError as error:
-        if args.checkpoint is None:
-            raise
-        parser.error(f"--checkpoint: {error}")
+    if args.checkpoint is not None and args.checkpoint.exists():
+        try:
+            load(args.checkpoint, settings)  # refused before anything runs
+        except ValueError as error:
+            parser.error(f"--checkpoint: {error}")
+    result = run_seeds(settings, args.checkpoint)
     print(table(result["rows"], result["references"]))
     path = args.out / "pendulum.png"
     figure(result["rows"], result["references"], path)
