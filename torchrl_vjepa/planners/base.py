@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -17,13 +17,15 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import MPCPlannerBase
 
 from torchrl_vjepa.actions import ActionCodec
-from torchrl_vjepa.generators import pack_generator, unpack_generator
+from torchrl_vjepa.generators import offspring, pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
 from torchrl_vjepa.planners.proposal import Proposal, ProposalFamily
 from torchrl_vjepa.risk import REJECTED_COST, ChanceConstraint, Risk
 
 __all__ = ["Plan", "Planner"]
 
+_STATISTICS = ("actions", "std", "cost", "violation")
+_SAMPLING = ("num_samples", "risk", "constraints", "fusion")
 _GENERATORS = ("_generator", "_model_generator")
 
 
@@ -105,7 +107,8 @@ class Planner(MPCPlannerBase):
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
             (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
             there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
-            ``(*B, C)``); cost and violation from fresh noise.
+            ``(*B, C)``); cost and violation from fresh noise. A mapping ``name -> risk`` also writes these
+            risks of the plan's cost, from the same noise, under ``("plan_stats", name)``.
         plan_key: the plan's entry.
         init_key: set where an episode begins (``InitTracker``).
         seed: of the generator; by default the global seed, ``torch.initial_seed()``.
@@ -158,7 +161,7 @@ class Planner(MPCPlannerBase):
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: Literal["energy", "weight", "propose"] | None = None,
-        return_stats: bool = False,
+        return_stats: bool | Mapping[str, Risk] = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
         seed: int | None = None,
@@ -188,7 +191,8 @@ class Planner(MPCPlannerBase):
         self.num_samples, self.risk, self.fusion = num_samples, risk, fusion
         self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
-        self.warm_start, self.warm_std, self.return_stats = warm_start, warm_std, return_stats
+        self.warm_start, self.warm_std = warm_start, warm_std
+        self.return_stats, self.stats_risks = bool(return_stats), self._checked_risks(return_stats)
         self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
         self.action_shape = tuple(codec.shape)
         own = self._env_objective
@@ -198,14 +202,14 @@ class Planner(MPCPlannerBase):
             reads += [self.plan_key, self.init_key]
             writes.append(unravel_key(("next", self.plan_key)))
         if return_stats:
-            names = ["actions", "std", "cost", *(["violation"] if self._constrained else [])]
+            names = [*_STATISTICS[: None if self._constrained else -1], *self.stats_risks]
             writes += [("plan_stats", name) for name in names]
         self.in_keys, self.out_keys = reads, writes
         if generator is None:
             generator = torch.Generator(self.low.device)
             generator.manual_seed(torch.initial_seed() if seed is None else seed)
         self._generator = generator
-        self._model_generator = _offspring(generator, generator.device)
+        self._model_generator = offspring(generator, generator.device)
 
     @property
     def low(self) -> Tensor:
@@ -239,7 +243,7 @@ class Planner(MPCPlannerBase):
             seed: any integer that ``torch.Generator.manual_seed`` takes.
         """
         self._generator.manual_seed(seed)
-        self._model_generator = _offspring(self._generator, self._generator.device)
+        self._model_generator = offspring(self._generator, self._generator.device)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that carries the plan from step to step, zero at every reset.
@@ -382,11 +386,23 @@ class Planner(MPCPlannerBase):
             generator = self._model_generator
             frequency = self._source.violation_probability(state, plan, generator=generator, **asked)
             statistics.append(frequency.squeeze(-2))
+        for risk in self.stats_risks.values():
+            self._model_generator.set_state(noise)
+            alone = {"constraints": ()} if self._constrained else {}
+            statistics.append(self._evaluate(state, plan, risk=risk, **alone))
         return statistics
 
-    def _evaluate(self, state: Any, candidates: Tensor) -> Tensor:
-        names = "num_samples", "risk", "constraints", "fusion"
-        asked = _given({name: getattr(self, name) for name in names})
+    def _checked_risks(self, return_stats: bool | Mapping[str, Risk]) -> dict[str, Risk]:
+        """The risks that are reported, refused early where they cannot be."""
+        risks = dict(return_stats) if isinstance(return_stats, Mapping) else {}
+        for name, risk in risks.items():
+            if name in _STATISTICS:
+                raise ValueError(f"return_stats must not rename {name!r}, which is always written")
+            self._checked_sampling(_given({name: getattr(self, name) for name in _SAMPLING}) | {"risk": risk})
+        return risks
+
+    def _evaluate(self, state: Any, candidates: Tensor, **instead: Any) -> Tensor:
+        asked = _given({name: getattr(self, name) for name in _SAMPLING}) | instead
         generator = self._model_generator
         costs = self._source.objective(state, candidates, generator=generator, **asked)
         costs = costs.to(candidates.dtype)
@@ -406,8 +422,8 @@ class Planner(MPCPlannerBase):
     def _follow_device(self) -> None:
         """Generators live on one device: after ``.to(device)`` new ones continue from the old."""
         if self._generator.device != self.low.device:
-            self._generator = _offspring(self._generator, self.low.device)
-            self._model_generator = _offspring(self._generator, self.low.device)
+            self._generator = offspring(self._generator, self.low.device)
+            self._model_generator = offspring(self._generator, self.low.device)
 
 
 def check_counts(**counts: int) -> None:
@@ -425,12 +441,6 @@ def check_counts(**counts: int) -> None:
     for name, value in counts.items():
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-
-
-def _offspring(generator: torch.Generator, device: torch.device) -> torch.Generator:
-    """A new generator, seeded by a draw from another."""
-    seed = torch.randint(2**62, (), generator=generator, device=generator.device)
-    return torch.Generator(device).manual_seed(int(seed))
 
 
 def _given(arguments: dict[str, Any]) -> dict[str, Any]:

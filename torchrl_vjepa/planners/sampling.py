@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.noise import coloured_noise_factor
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.risk import REJECTED_COST
 
@@ -48,6 +49,10 @@ class SamplingPlanner(Planner):
         antithetic: draw noise in pairs of opposite sign.
         output: the plan is the ``"mean"`` of the proposal (where actions are discrete its most probable
             plan), or the ``"best"`` candidate seen.
+        noise_beta: colour of the noise along a plan, from 0 (white: every step is drawn alone) to 4: with a
+            power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
+            (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
+        keep_elites: fraction of the elites that are candidates again in the next round.
         **kwargs: see :class:`Planner`.
 
     Raises:
@@ -79,6 +84,8 @@ class SamplingPlanner(Planner):
         (tensor([0.5000]), torch.Size([1, 1]))
     """
 
+    _colour: Tensor | None
+
     def __init__(
         self,
         env: EnvBase,
@@ -90,6 +97,8 @@ class SamplingPlanner(Planner):
         min_std: float = 0.01,
         antithetic: bool = True,
         output: Literal["mean", "best"] = "mean",
+        noise_beta: float = 0.0,
+        keep_elites: float = 0.0,
         **kwargs: Any,
     ) -> None:
         check_counts(num_candidates=num_candidates)
@@ -101,9 +110,18 @@ class SamplingPlanner(Planner):
             raise ValueError(f"min_std must be in (0, 1], got {min_std}")
         if output not in ("mean", "best"):
             raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
+        if not 0 <= noise_beta <= 4:
+            raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
+        if not 0 <= keep_elites <= 1:
+            raise ValueError(f"keep_elites must be in [0, 1], got {keep_elites}")
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
+        self.noise_beta, self.keep_elites = noise_beta, keep_elites
+        # The best plan is a candidate again anyway, so it is the next ones that are kept.
+        self._num_kept = min(int(keep_elites * top_k), top_k - 1, max(0, num_candidates - 2))
+        colour = coloured_noise_factor(planning_horizon, noise_beta) if noise_beta else None
+        self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
     @abc.abstractmethod
     def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
@@ -133,11 +151,12 @@ class SamplingPlanner(Planner):
         codec, family = self.codec, self.family
         best = codec.mode(proposal.mean)
         best_cost = best.new_full(best.shape[:-2], math.inf)
+        kept = None
         model_state = self._model_generator.get_state()
         for _ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
             self._model_generator.set_state(model_state)
-            candidates = self._candidates(proposal, best)
+            candidates = self._candidates(proposal, best, kept)
             costs = self._evaluate(state, candidates)
             elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
             if self._constrained:
@@ -145,6 +164,7 @@ class SamplingPlanner(Planner):
                 elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
             index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
             elites = candidates.gather(-3, index)
+            kept = elites[..., 1 : 1 + self._num_kept, :, :]
             found = elite_costs[..., 0].isfinite()[..., None, None]
             better = elite_costs[..., 0] < best_cost
             best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
@@ -162,7 +182,7 @@ class SamplingPlanner(Planner):
             actions = torch.where(worse[..., None, None], best, actions)
         return Plan(actions, proposal.std, best, best_cost)
 
-    def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
+    def _candidates(self, proposal: Proposal, best: Tensor, kept: Tensor | None = None) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
         mean = proposal.mean
         num = self.num_candidates
@@ -173,6 +193,8 @@ class SamplingPlanner(Planner):
             device=mean.device,
             dtype=mean.dtype,
         )
+        if self._colour is not None:
+            noise = self._colour @ noise
         if self.antithetic:
             noise = torch.cat([noise, -noise])[:num]
         candidates = self.family.draw(proposal, noise)
@@ -180,4 +202,6 @@ class SamplingPlanner(Planner):
             candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
+        if kept is not None and self._num_kept:
+            candidates[..., num - self._num_kept :, :, :] = kept
         return candidates
