@@ -9,13 +9,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Bounded, Categorical
-from torchrl.envs import PendulumEnv
+from torchrl.data import Binary, Bounded, Categorical, Composite
+from torchrl.envs import Compose, InitTracker, PendulumEnv, TransformedEnv
 
 from torchrl_vjepa.costs import quadratic_cost
 from torchrl_vjepa.distributions import Delta, diag_gaussian
 from torchrl_vjepa.envs import LatentEnv
-from torchrl_vjepa.planners import CEM, MPPI, Planner, Proposal, RandomShooting
+from torchrl_vjepa.planners import CEM, MPPI, GradientMPC, Plan, Planner, Proposal, RandomShooting
 from torchrl_vjepa.planners.noise import coloured_noise_factor
 from torchrl_vjepa.priors import Ball, RegionPrior
 from torchrl_vjepa.risk import REJECTED_COST, ChanceConstraint, cvar, expectation, worst_case
@@ -193,6 +193,76 @@ class TestReportedRisks:
 
 def _always(latent: Tensor, action: Tensor) -> Tensor:
     return torch.ones_like(latent[..., 0]).bool()
+
+
+class Counter(CEM):
+    """Counts its searches."""
+
+    searches = 0
+
+    def plan(self, state: Any, proposal: Proposal) -> Plan:
+        self.searches += 1
+        return super().plan(state, proposal)
+
+
+class TestReplanInterval:
+    @pytest.mark.parametrize(
+        "spec", [Bounded(-1, 1, (2,)), Categorical(2), Composite(a=Binary(1), b=Binary(1))]
+    )
+    def test_a_plan_is_executed_step_by_step(self, spec: Any) -> None:
+        planner = Counter(make_env(spec=spec), 5, 2, 32, seed=0, replan_interval=3, return_stats=True)
+        td, plans, taken = states(4), [], []
+        for step in range(7):
+            out = planner(td.clone())
+            assert planner.searches == 1 + step // 3
+            plans.append(planner.codec.mode(out["plan_stats", "actions"]))
+            taken.append(planner.codec.encode(out))
+            torch.testing.assert_close(out["next", "plan_age"], torch.full((4, 1), (step + 1) % 3))
+            td = states(4).update(out["next"]).set("is_init", torch.zeros(4, 1).bool())
+        for step in range(7):
+            begin = 3 * (step // 3)
+            torch.testing.assert_close(taken[step], plans[begin][:, step - begin])
+
+    def test_rows_are_at_steps_of_their_own(self) -> None:
+        planner = Counter(make_env(), 5, 2, 32, seed=0, replan_interval=4)
+        out = planner(states(3))
+        td = states(3).update(out["next"])
+        td["is_init"] = torch.tensor([[False], [True], [False]])
+        again = planner(td.clone())
+        assert planner.searches == 2  # for the row that begins
+        assert again["next", "plan_age"].flatten().tolist() == [2, 1, 2]
+        torch.testing.assert_close(again["action"][[0, 2]], out["next", "plan"][[0, 2], 0])
+        planner.set_seed(0)
+        planner(states(3))
+        new = planner(states(3))
+        torch.testing.assert_close(again["action"][1], new["action"][1])
+
+    def test_torchrl_carries_plan_and_age(self) -> None:
+        env = PendulumEnv(seed=0)
+        planner = Counter(env, 6, 2, 16, seed=0, replan_interval=3)
+        primer = planner.make_tensordict_primer()
+        assert set(primer.primers.keys()) == {"plan", "plan_age"}
+        env = TransformedEnv(env, Compose(InitTracker(), primer))
+        rollout = env.rollout(9, planner)
+        assert planner.searches == 3
+        assert rollout["plan_age"].flatten().tolist() == [0, 1, 2] * 3
+
+    def test_off_by_default_and_checked(self) -> None:
+        planner = CEM(make_env(), 3)
+        assert ("next", "plan_age") not in planner.out_keys
+        for kwargs in ({"replan_interval": 4}, {"replan_interval": 2, "warm_start": False}):
+            with pytest.raises(ValueError, match="replan_interval must be at most planning_horizon=3"):
+                CEM(make_env(), 3, **kwargs)
+        with pytest.raises(ValueError, match="replan_interval must be an integer of at least 1, got 0"):
+            CEM(make_env(), 3, replan_interval=0)
+        nested = CEM(make_env(), 3, plan_key=("memory", "plan"), replan_interval=2)
+        assert ("next", "memory", "plan_age") in nested.out_keys
+
+    def test_gradient_planning_too(self) -> None:
+        planner = GradientMPC(make_env(), 4, 10, seed=0, replan_interval=2)
+        out = planner(states())
+        again = planner(states().update(out["next"]))
+        assert torch.equal(again["action"], out["next", "plan"][:, 0])
 
 
 class TestRegions:

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.base import Planner
 from torchrl_vjepa.planners.noise import coloured_noise_factor
+from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.risk import REJECTED_COST
 
