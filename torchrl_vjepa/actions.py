@@ -133,7 +133,8 @@ class ActionCodec(nn.Module):
         """The layout of the code as tensors, which move with the module."""
         sizes = [size for leaf in leaves for size in leaf.sizes]
         widest = max(sizes, default=0)
-        block, choice, members = [0] * self.size, [-1] * self.size, []
+        block, choice = [0] * self.size, [-1] * self.size
+        members: list[list[int]] = []
         position = 0
         for leaf in leaves:
             if leaf.kind in ("number", "bit"):

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.distributions.modes import MakeOptimizer
-from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.squash import squash, unsquash
 

@@ -12,7 +12,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.noise import coloured_noise_factor
+from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.risk import REJECTED_COST
 
@@ -56,6 +58,10 @@ class SamplingPlanner(Planner):
             the device after each round, and how far planning gets depends on the machine and the batch size.
         output: the plan is the ``"mean"`` of the proposal (where actions are discrete its most probable
             plan), or the ``"best"`` candidate seen.
+        noise_beta: colour of the noise along a plan, from 0 (white: every step is drawn alone) to 4: with a
+            power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
+            (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
+        keep_elites: fraction of the elites that are candidates again in the next round.
         **kwargs: see :class:`Planner`.
 
     Raises:
@@ -87,6 +93,8 @@ class SamplingPlanner(Planner):
         (tensor([0.5000]), torch.Size([1, 1]))
     """
 
+    _colour: Tensor | None
+
     def __init__(
         self,
         env: EnvBase,
@@ -100,6 +108,8 @@ class SamplingPlanner(Planner):
         chunk_size: int | None = None,
         max_ms: float | None = None,
         output: Literal["mean", "best"] = "mean",
+        noise_beta: float = 0.0,
+        keep_elites: float = 0.0,
         **kwargs: Any,
     ) -> None:
         check_counts(num_candidates=num_candidates)
@@ -115,10 +125,19 @@ class SamplingPlanner(Planner):
             check_counts(chunk_size=chunk_size)
         if max_ms is not None and not 0 < max_ms < math.inf:
             raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
+        if not 0 <= noise_beta <= 4:
+            raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
+        if not 0 <= keep_elites <= 1:
+            raise ValueError(f"keep_elites must be in [0, 1], got {keep_elites}")
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
         self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
+        self.noise_beta, self.keep_elites = noise_beta, keep_elites
+        # The best plan is a candidate again anyway, so it is the next ones that are kept.
+        self._num_kept = min(int(keep_elites * top_k), top_k - 1, max(0, num_candidates - 2))
+        colour = coloured_noise_factor(planning_horizon, noise_beta) if noise_beta else None
+        self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
     @abc.abstractmethod
     def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
@@ -152,10 +171,11 @@ class SamplingPlanner(Planner):
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
         clock = None if self.max_ms is None else _Clock(self.max_ms)
+        kept = None
         for _ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
             generator.set_state(model_state)
-            candidates = self._candidates(proposal, best)
+            candidates = self._candidates(proposal, best, kept)
             costs = evaluate(candidates)
             elite_costs, index = costs.topk(top_k, dim=-1, largest=False)
             if constrained:
@@ -163,6 +183,7 @@ class SamplingPlanner(Planner):
                 elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
             index = index.unsqueeze(-1).unsqueeze(-1).expand(*index.shape, *candidates.shape[-2:])
             elites = candidates.gather(-3, index)
+            kept = elites[..., 1 : 1 + self._num_kept, :, :]
             lowest = elite_costs.select(-1, 0)  # infinite where no cost is finite
             better = (lowest < best_cost).unsqueeze(-1).unsqueeze(-1)
             best = torch.where(better, elites.select(-3, 0), best)
@@ -183,8 +204,9 @@ class SamplingPlanner(Planner):
             actions = torch.where(worse[..., None, None], best, actions)
         return Plan(actions, proposal.std, best, best_cost)
 
-    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
-        evaluate, size, generator = super()._evaluator(state), self.chunk_size, self._model_generator
+    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
+        evaluate = super()._evaluator(state, **instead)
+        size, generator = self.chunk_size, self._model_generator
         if size is None:
             return evaluate
 
@@ -198,7 +220,7 @@ class SamplingPlanner(Planner):
 
         return in_chunks
 
-    def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
+    def _candidates(self, proposal: Proposal, best: Tensor, kept: Tensor | None = None) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
         mean = proposal.mean
         num = self.num_candidates
@@ -209,6 +231,8 @@ class SamplingPlanner(Planner):
             device=mean.device,
             dtype=mean.dtype,
         )
+        if self._colour is not None:
+            noise = self._colour @ noise
         if self.antithetic:
             noise = torch.cat([noise, -noise])[:num]
         candidates = self.family.draw(proposal, noise)
@@ -216,6 +240,8 @@ class SamplingPlanner(Planner):
             candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
+        if kept is not None and self._num_kept:
+            candidates[..., num - self._num_kept :, :, :] = kept
         return candidates
 
 
