@@ -21,7 +21,7 @@ from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.imagination import Tasks, check_device, densities, drawn, imagine, imagine_fused
-from torchrl_vjepa.latent_step import LatentStep
+from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 
@@ -160,7 +160,8 @@ class LatentEnv(ModelBasedEnvBase):
                 f"got {num_samples} with how={how!r} and no belief_key"
             )
         Sampling.checked(num_samples if sampled else None, risk, constraints)
-        predictor = getattr(model, "predictor", model)
+        # What is a transition itself comes first: a FusedPredictor has a predictor inside.
+        predictor = model if hasattr(model, "dist") else getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
         if not callable(transition):
             raise TypeError(
@@ -354,7 +355,8 @@ class LatentEnv(ModelBasedEnvBase):
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
 
         Raises:
-            ValueError: if a shape does not fit, or what is asked for needs samples and has none.
+            ValueError: if a shape does not fit, what is asked for needs samples and has none, or actions
+                require gradients and the energy of the prior gives none.
         """
         settings = self.sampling(num_samples, risk, constraints, fusion)
         start, actions = self._start(state, actions, settings.num_samples, generator)
@@ -362,17 +364,37 @@ class LatentEnv(ModelBasedEnvBase):
         if settings.fusion == "propose":
             prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
             latents, evidence = imagine_fused(world_model.transition, start, actions, prior_at, generator)
-            own = world_model.own_cost(latents, actions)
-            costs = -evidence if own is None else own - evidence
+            if actions.requires_grad and not evidence.requires_grad:
+                raise ValueError(NO_GRADIENT)
+            costs = self._corrected_cost(state, latents, actions, evidence)
+            if settings.constraints:  # what violates is what the dynamics do, not what the prior asks of them
+                latents = imagine(world_model.transition, start, actions, "sample", generator)
         else:
             latents = imagine(
                 world_model.transition, start, actions, self._following(state, settings), generator
             )
-            costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-        costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
+            costs = world_model.stage_cost(
+                latents, actions, self._tasks(state, actions), needs_gradient=actions.requires_grad
+            )
+            costs = world_model.until_end(costs, latents, actions)
+        costs = costs.sum(dim=-1)
         if settings.num_samples is None:
             return costs
         return plan_cost(costs, settings.risk, settings.constraints, latents, actions)
+
+    def _corrected_cost(
+        self, state: Tensor | TensorDictBase, latents: Tensor, actions: Tensor, evidence: Tensor
+    ) -> Tensor:
+        """Costs ``(M, *B, N, H)`` of trajectories that were drawn from the fused transition."""
+        world_model = self.world_model
+        if world_model.termination_model is None:
+            own = world_model.own_cost(latents, actions)
+            return -evidence if own is None else own - evidence
+        # The draw has met the prior at every step; what is wanted counts it until the end.
+        tasks = self._tasks(state, actions)
+        energy = world_model.prior.energy(latents, tasks)
+        counted = world_model.until_end(world_model.stage_cost(latents, actions, tasks), latents, actions)
+        return counted - energy - evidence
 
     def violation_probability(
         self,

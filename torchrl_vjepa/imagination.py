@@ -9,8 +9,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_vjepa.belief import Transition, resampling_index, rollout
-from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
+from torchrl_vjepa.belief import ParticleBelief, Transition, resampling_index, rollout
+from torchrl_vjepa.common_random_numbers import CommonNoise, common_particle, sample_common
 from torchrl_vjepa.fusion import fuse
 from torchrl_vjepa.priors import LatentDensity, Prior
 
@@ -165,7 +165,15 @@ def imagine_fused(
     latents, evidence = [], []
     for k, action in enumerate(actions.unbind(-2)):
         fusion = fuse(transition(latent, action), prior_at(k), generator=generator, shared_noise=True)
-        latent = sample_common(fusion.posterior, generator=generator)
+        posterior, log_evidence = fusion.posterior, fusion.log_evidence
+        if isinstance(posterior, ParticleBelief):
+            index = common_particle(posterior, generator=generator).unsqueeze(-1)
+            latent = torch.take_along_dim(posterior.particles, index.unsqueeze(-1), -2).squeeze(-2)
+            # Which particle is taken cannot move with the plan: its probability does (value zero).
+            log_prob = posterior.log_weights.log_softmax(-1).take_along_dim(index, -1).squeeze(-1)
+            log_evidence = log_evidence + log_prob - log_prob.detach()
+        else:
+            latent = sample_common(posterior, generator=generator)
         latents.append(latent)
-        evidence.append(fusion.log_evidence.expand(latent.shape[:-1]))
+        evidence.append(log_evidence.expand(latent.shape[:-1]))
     return torch.stack(latents, dim=-2), torch.stack(evidence, dim=-1)
