@@ -366,7 +366,7 @@ class LatentEnv(ModelBasedEnvBase):
             latents, evidence = imagine_fused(world_model.transition, start, actions, prior_at, generator)
             if actions.requires_grad and not evidence.requires_grad:
                 raise ValueError(NO_GRADIENT)
-            costs = self._corrected_cost(state, latents, actions, evidence)
+            costs = world_model.fused_cost(latents, actions, evidence, self._tasks(state, actions))
             if settings.constraints:  # what violates is what the dynamics do, not what the prior asks of them
                 latents = imagine(world_model.transition, start, actions, "sample", generator)
         else:
@@ -381,20 +381,6 @@ class LatentEnv(ModelBasedEnvBase):
         if settings.num_samples is None:
             return costs
         return plan_cost(costs, settings.risk, settings.constraints, latents, actions)
-
-    def _corrected_cost(
-        self, state: Tensor | TensorDictBase, latents: Tensor, actions: Tensor, evidence: Tensor
-    ) -> Tensor:
-        """Costs ``(M, *B, N, H)`` of trajectories that were drawn from the fused transition."""
-        world_model = self.world_model
-        if world_model.termination_model is None:
-            own = world_model.own_cost(latents, actions)
-            return -evidence if own is None else own - evidence
-        # The draw has met the prior at every step; what is wanted counts it until the end.
-        tasks = self._tasks(state, actions)
-        energy = world_model.prior.energy(latents, tasks)
-        counted = world_model.until_end(world_model.stage_cost(latents, actions, tasks), latents, actions)
-        return counted - energy - evidence
 
     def violation_probability(
         self,

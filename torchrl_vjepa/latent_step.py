@@ -249,6 +249,25 @@ class LatentStep(TensorDictModuleBase):
         alive = torch.cat([torch.ones_like(alive[..., :1]), alive[..., :-1]], dim=-1)
         return alive * (costs + probability * self.termination_cost)
 
+    def fused_cost(self, latent: Tensor, action: Tensor, log_evidence: Tensor, task: Task = None) -> Tensor:
+        """Costs of trajectories that were drawn from the fused transition, as far as an episode lives.
+
+        Args:
+            latent: next latents, of shape ``(*B, H, D)``.
+            action: flat, of shape ``(*B, H, A)``.
+            log_evidence: of every step's fusion, of shape ``(*B, H)``.
+            task: of the prior.
+
+        Returns:
+            Of shape ``(*B, H)``.
+        """
+        if self.termination_model is None:
+            own = self.own_cost(latent, action)
+            return -log_evidence if own is None else own - log_evidence
+        # The draws have met the prior at every step; what is wanted counts it until the end alone.
+        counted = self.until_end(self.stage_cost(latent, action, task), latent, action)
+        return counted - self.prior.energy(latent, task) - log_evidence  # type: ignore[union-attr]
+
     def _reward(self, latent: Tensor, action: Tensor) -> Tensor:
         batch = latent.shape[:-1]
         shaped = action.reshape((*batch, *self.action_shape))

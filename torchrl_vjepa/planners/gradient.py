@@ -213,7 +213,7 @@ class GradientMPC(Planner):
                     "the cost must be differentiable in the actions, got one to which no gradient flows "
                     f"through {type(self.env).__name__}; use a sampling planner (CEM, MPPI) for it"
                 )
-            found.guided = found.guided | gradient.isfinite().flatten(-2).all(dim=-1).any(dim=-1)
+            found.guided = found.guided | gradient.isfinite().flatten(-3).any(dim=-1)
             # LBFGS wants its gradients contiguous.
             x.grad = gradient.nan_to_num(0.0, 0.0, 0.0).contiguous()
             return objective.detach()
