@@ -489,3 +489,19 @@ class TestNothingIsIgnored:
             )
             assert "goal" in stepped.in_keys
             torch.testing.assert_close(stepped(td.clone())["action"], plain(td.clone())["action"])
+
+    def test_the_proposing_route_reads_the_task_of_each_step(self) -> None:
+        env = make_env(Well())
+        path = torch.tensor([[0.5, 0.2], [-0.5, 0.4], [0.8, -0.6]], dtype=torch.float64)
+        state = env.planning_state(TensorDict(latent=torch.zeros(2, dtype=torch.float64), goal=path))
+        actions, generator = plans((), num=3, horizon=3), torch.Generator().manual_seed(0)
+        draws = torch.stack(
+            [
+                env.objective(state, actions, generator=generator, num_samples=2000, fusion="propose")
+                for _ in range(10)
+            ]
+        )
+        p = joint(torch.zeros(2, dtype=torch.float64), actions)
+        covariance = p.covariance_matrix + 0.5**2 * torch.eye(6, dtype=torch.float64)
+        exact = -MultivariateNormal(p.mean, covariance).log_prob(path.flatten())
+        assert ((draws.mean(0) - exact).abs() < 4 * draws.std(0) / 10**0.5 + 0.5 * draws.var(0) + 1e-3).all()
