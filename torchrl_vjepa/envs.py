@@ -21,8 +21,8 @@ from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.belief import PreparedTransition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
-from torchrl_vjepa.imagination import Tasks, check_device, densities, first_latents, imagine, imagine_fused
-from torchrl_vjepa.latent_step import LatentStep
+from torchrl_vjepa.imagination import Tasks, check_prior, densities, first_latents, imagine, imagine_fused
+from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 
@@ -166,7 +166,8 @@ class LatentEnv(ModelBasedEnvBase):
                 f"got {num_samples} with how={how!r} and no belief_key"
             )
         Sampling.checked(num_samples if sampled else None, risk, constraints)
-        predictor = getattr(model, "predictor", model)
+        # What is a transition itself comes first: a FusedPredictor has a predictor inside.
+        predictor = model if hasattr(model, "dist") else getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
         if not callable(transition):
             raise TypeError(
@@ -195,15 +196,12 @@ class LatentEnv(ModelBasedEnvBase):
             latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key), prior=prior,
             termination_model=termination_model, termination_cost=termination_cost,
         )  # fmt: skip
-        prior_dim = getattr(prior, "latent_dim", None)
-        if prior_dim not in (None, latent_dim):
-            raise ValueError(f"prior must be over latents of size {latent_dim}, got latent_dim={prior_dim}")
         parameter = next((p for p in world_model.parameters() if p.is_floating_point()), None)
         if device is None:
             device = "cpu" if parameter is None else parameter.device
         if dtype is None:
             dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
-        check_device(prior, torch.device(device))
+        check_prior(prior, latent_dim, torch.device(device))
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
         self.codec = codec.to(self.device)
         self.latent_dim, self.action_dim = latent_dim, action_dim
@@ -361,7 +359,8 @@ class LatentEnv(ModelBasedEnvBase):
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
 
         Raises:
-            ValueError: if a shape does not fit, or what is asked for needs samples and has none.
+            ValueError: if a shape does not fit, what is asked for needs samples and has none, or actions
+                require gradients and the energy of the prior gives none.
         """
         evaluate = self.objective_from(
             state, num_samples=num_samples, risk=risk, constraints=constraints, fusion=fusion
@@ -388,16 +387,21 @@ class LatentEnv(ModelBasedEnvBase):
 
         def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
             start, actions = self._start(state, actions, given.num_samples, generator)
+            tasks = self._tasks(state, actions)
             if given.fusion == "propose":
-                prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
+                prior_at = densities(world_model.prior, tasks, actions.ndim - 3)
                 latents, evidence = imagine_fused(transition, start, actions, prior_at, generator)
-                own = world_model.own_cost(latents, actions)
-                costs = -evidence if own is None else own - evidence
+                if actions.requires_grad and not evidence.requires_grad:
+                    raise ValueError(NO_GRADIENT)
+                costs = world_model.fused_cost(latents, actions, evidence, tasks)
+                if given.constraints:  # what violates is what the dynamics do, not what the prior asks for
+                    latents = imagine(transition, start, actions, "sample", generator)
             else:
                 latents = imagine(transition, start, actions, self._following(state, given), generator)
-                latents = latents.to(start.dtype)
-                costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-            costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
+                latents, needs_gradient = latents.to(start.dtype), actions.requires_grad
+                costs = world_model.stage_cost(latents, actions, tasks, needs_gradient=needs_gradient)
+                costs = world_model.until_end(costs, latents, actions)
+            costs = costs.sum(dim=-1)
             if given.num_samples is None:
                 return costs
             return plan_cost(costs, given.risk, given.constraints, latents, actions)
