@@ -189,7 +189,7 @@ def train_restarts(
     return [Trained(loss.get_model(index), loss.target_encoder(index)) for index in chosen]
 
 
-def train_reward(model: LatentModel, system: System) -> TensorDictModule:
+def train_reward(model: LatentModel, system: System, data: TensorDict | None = None) -> TensorDictModule:
     """A quadratic reward head on predicted latents; the problem is convex, so LBFGS solves it."""
     torch.manual_seed(system.seed)
     head = QuadraticReward(model.predictor.latent_dim, model.predictor.action_dim)
@@ -201,7 +201,7 @@ def train_reward(model: LatentModel, system: System) -> TensorDictModule:
 
     def closure() -> Tensor:
         optimizer.zero_grad()
-        value = loss(system.data)["loss_reward"]
+        value = loss(system.data if data is None else data)["loss_reward"]
         value.backward()
         return value
 
