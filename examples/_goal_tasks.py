@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -153,15 +153,27 @@ def references(tasks: Sequence[Task], steps: int) -> Tensor:
     return torch.stack([task.reference[times % len(task.reference)] for task in tasks])
 
 
-def run_oracle(env: BatchedNoisyTVEnv, wanted: Tensor) -> TensorDict:
-    """Episodes under the optimal controller: Kalman filter and tracking, for each row's references."""
+def run_oracle(
+    env: BatchedNoisyTVEnv, wanted: Tensor, see: Callable[[Tensor], Tensor] | None = None
+) -> TensorDict:
+    """Episodes under the optimal controller: Kalman filter and tracking, for each row's references.
+
+    Args:
+        env: the noisy TV.
+        wanted: references of each row, ``(rows, steps, 4)``.
+        see: what tells the signal from a frame, in place of the Kalman filter.
+
+    Returns:
+        The episodes, ``(rows, steps)``.
+    """
     gains, feedforwards = tracking(env.system, wanted)
     kalman = KalmanFilter(env.system, env.noise_scale)
     memory = torch.zeros(len(wanted), len(kalman.F), dtype=torch.float64)
     state, steps = env.reset(), []
     for t, (gain, feedforward) in enumerate(zip(gains, feedforwards.unbind(-2), strict=True)):
         mean = kalman.update(memory, state["observation"], torch.tensor(t))
-        action = feedforward - mean[..., : env.system.signal_dim] @ gain.mT
+        signal = mean[..., : env.system.signal_dim] if see is None else see(state["observation"])
+        action = feedforward - signal @ gain.mT
         state["action"] = action.clamp(-2.0, 2.0).float()
         memory = kalman.predict(mean, state["action"])
         step, state = env.step_and_maybe_reset(state)
