@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torch import Tensor
+
 from _goal_tasks import (
     EFFORT,
     NOWHERE,
@@ -16,9 +19,6 @@ from _goal_tasks import (
     tracking,
     violations,
 )
-from tensordict import TensorDict
-from torch import Tensor
-
 from torchrl_vjepa import BatchedNoisyTVEnv, LinearGaussianSystem, LQGController
 from torchrl_vjepa.noisy_tv import solve_lqr
 
@@ -96,7 +96,9 @@ def test_tasks_and_what_they_count() -> None:
     circle = references(tasks, 6)[0]
     torch.testing.assert_close(circle[0], tasks[0].reference[1])
     torch.testing.assert_close(circle[-1], tasks[0].reference[1])
-    goal, one, two = (next(t for t in tasks if t.name == f"{name}-1") for name in ("goal", "keep-out", "two-regions"))
+    goal, one, two = (
+        next(t for t in tasks if t.name == f"{name}-1") for name in ("goal", "keep-out", "two-regions")
+    )
     held = steady_state(env.system, goal.reference[:1])[0] @ plane
     torch.testing.assert_close((two.regions - held).norm(dim=-1), torch.full((2,), 0.4, dtype=torch.float64))
     assert (goal.regions == NOWHERE).all()
