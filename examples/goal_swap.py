@@ -92,7 +92,6 @@ METHODS = {
 }
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")
 NOISE_SCALE = 8.0
-STEPS = 200
 FAMILIES = ("goal", "keep-out", "two-regions", "circle")
 Row = dict[str, Any]
 
@@ -116,7 +115,8 @@ class Settings(Recipe):
     temperature: float = option(1.0, "MPPI temperature, in standard deviations of the elites' costs")
     gradient_steps: int = option(20, "gradient steps for each action")
     gradient_lr: float = option(0.1, "their size, in units of the spread of a cold start")
-    episodes: int = option(2, "evaluation episodes of 200 steps for each task")
+    episodes: int = option(2, "evaluation episodes for each task")
+    steps: int = option(200, "steps of an evaluation episode, at most 200")
     continual_tasks: int = option(10, "tasks in a row, after which the first is tried again")
     finetune_steps: int = option(200, "optimiser steps of the model that is fine-tuned on each task's reward")
     finetune_lr: float = option(0.003, "its peak learning rate")
@@ -125,9 +125,10 @@ class Settings(Recipe):
 QUICK = {
     "frames": 4_000,
     "restarts": 2,
-    "train_steps": 150,
+    "train_steps": 300,
     "goals": 2,
     "episodes": 1,
+    "steps": 60,
     "optim_steps": 2,
     "num_candidates": 64,
     "top_k": 8,
@@ -304,7 +305,7 @@ class Bench:
         for transform in get_env_transforms_from_module(policy):
             env.append_transform(transform)
         with torch.no_grad():
-            return env.rollout(STEPS, policy).select("action", ("next", "signal"))
+            return env.rollout(self.settings.steps, policy).select("action", ("next", "signal"))
 
     def oracle(
         self,
@@ -321,12 +322,12 @@ class Bench:
         """
         if goal is not None:
             tasks = [replace(task, reference=goal(task.film)) for task in tasks]
-        return run_oracle(self.env(tasks), references(self.rows(tasks), STEPS), state)
+        return run_oracle(self.env(tasks), references(self.rows(tasks), self.settings.steps), state)
 
     def judge(self, tasks: Sequence[Task], episodes: TensorDict) -> list[tuple[float, float]]:
         """Mean cost of a step and share of steps in a region, for each task."""
         rows = self.rows(tasks)
-        costs = stage_costs(episodes, references(rows, STEPS))
+        costs = stage_costs(episodes, references(rows, self.settings.steps))
         regions = torch.stack([task.regions for task in rows])
         inside = violations(episodes, regions, self.plane, self.settings.radius).double()
         both = (values.reshape(len(tasks), -1).mean(1).tolist() for values in (costs, inside))
