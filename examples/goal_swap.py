@@ -627,8 +627,8 @@ def figure(result: Result, path: Path) -> None:
     }
     titles = (
         "Goals, each shown as one noisy frame",
-        "One region to keep out of",
-        "Two regions to keep out of",
+        "A region to keep out of, for each goal",
+        "Two regions, for each goal",
         f"A circle in {settings.period} steps, shown as a film",
     )
     for ax, family, title in zip(axes, FAMILIES, titles, strict=True):
@@ -656,7 +656,16 @@ def figure(result: Result, path: Path) -> None:
                 continue
             ax.plot(*path_of.T, color=color, lw=0.5, alpha=0.35)
             ax.plot(*path_of[10:].T, color=color, ls="", marker=".", ms=2.5, zorder=3)
-            ax.plot(*goal[0], color="black", marker="x", ms=7, mew=1.8, zorder=5)
+            ax.plot(
+                *goal[0],
+                color="black",
+                marker="x",
+                ls="",
+                ms=7,
+                mew=1.8,
+                zorder=5,
+                label="goal" if k == 0 else None,
+            )
             for centre in task.regions:
                 if centre.abs().max() < NOWHERE / 2:
                     ax.add_patch(
@@ -664,6 +673,9 @@ def figure(result: Result, path: Path) -> None:
                             centre.tolist(), settings.radius, fill=False, color=color, hatch="////", lw=1.2
                         )
                     )
+        if family == "goal":
+            ax.plot([], [], color="0.4", ls="", marker=".", label="true signal, BJEPA (after 10 steps)")
+            ax.legend(loc="upper right", frameon=False)
         ax.set(title=title, xlabel="signal, first direction of the plane", aspect="equal")
     axes[0].set(ylabel="signal, second direction of the plane", xlim=(-1.9, 1.9), ylim=(-1.9, 1.9))
     fig.savefig(path, dpi=150)
