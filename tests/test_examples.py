@@ -60,6 +60,7 @@ CLIFF_KEYS = {
     "success_rate",
 }
 UNCERTAINTY_KEYS = {"noise_scale", "seed", "horizon", "coverage_90", "crps", "oracle_crps"}
+GOAL_SWAP_KEYS = {"task", "method", "seed", "cost", "oracle_cost", "ratio", "violations"}
 FORK_KEYS = {"head", "planner", "seed", "test_log_prob", "wall_mass", "success"}
 # "path:line: Category: message", raised at a line of this repository
 WARNING = re.compile(r"\S*(?:torchrl_vjepa|examples)/\S*\.py:\d+: \w*Warning: .*")
@@ -299,7 +300,34 @@ def check_pendulum_report(report: dict[str, Any]) -> None:
         assert -200 * 16.28 < row["return_min"] <= row["return_mean"] <= 0
 
 
+def check_goal_swap_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``goal_swap.py``: its keys, its ranges, and that the first task stays the same."""
+    assert set(report) == {"settings", "wall_s", "swap_ms", "rows", "diagnostics"}
+    settings, rows = report["settings"], report["rows"]
+    assert report["wall_s"] > 0
+    assert report["swap_ms"] > 0
+    numbered = {f"{family}-{k}" for family in FAMILIES for k in range(settings["goals"])}
+    last = settings["continual_tasks"] - 1
+    continual = {"continual-0-after-0", f"continual-0-after-{last}"}
+    cells = {(row["task"], row["method"], row["seed"]): row for row in rows}
+    assert len(cells) == len(rows)
+    for row in rows:
+        assert set(row) == GOAL_SWAP_KEYS
+        assert row["cost"] > 0
+        assert math.isclose(row["ratio"], row["cost"] / row["oracle_cost"], rel_tol=1e-9)
+        assert 0 <= row["violations"] <= 1
+    for seed in settings["seeds"]:
+        for method in ("lqg", "bjepa", "bjepa-gradient", "jepa"):
+            done = {task for task, name, s in cells if (name, s) == (method, seed)}
+            assert done - continual == {*numbered, "circle"}, method
+        assert all(cells[task, "lqg", seed]["ratio"] == 1 for task in numbered)
+        before, after = (cells[task, "bjepa", seed] for task in sorted(continual))
+        assert before["cost"] == after["cost"], "the first task costs what it cost"
+
+
+FAMILIES = ("goal", "keep-out", "two-regions")
 CHECKS = {
+    "goal_swap": check_goal_swap_report,
     "fork": check_fork_report,
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,

@@ -124,7 +124,7 @@ def test_the_target_encoder_of_a_loss(several: bool) -> None:
     updater.step()
     torch.testing.assert_close(weight.detach(), start[index] + 0.5)
     goal = torch.randn(4, OBS)
-    p = GoalPrior(encoder, std=0.1)({"goal": goal})
+    p = GoalPrior(encoder, std=0.1)({"task": goal})
     assert isinstance(p, Distribution)
     torch.testing.assert_close(p.mean, goal @ weight.mT)
     # The loss and its model still train.

@@ -53,7 +53,7 @@ def cases() -> dict[str, Case]:
     wall = lambda **kwargs: RegionPrior(Ball(torch.zeros(D), 1.0), "out", sharpness=2.0, **kwargs)  # noqa: E731
     return {
         "gaussian": Case(lambda: GaussianPrior(D), None),
-        "goal": Case(lambda: GoalPrior(std=0.5, latent_dim=D), (D,)),
+        "goal": Case(lambda: GoalPrior(std=0.5, latent_dim=D, task_key="goal"), (D,)),
         "mapped goal": Case(lambda: GoalPrior(nn.Linear(2, D), std=0.5), (2,)),
         "function goal": Case(lambda: GoalPrior(sines, std=torch.ones(D)), (2,)),
         "image goal": Case(

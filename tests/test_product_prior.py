@@ -153,25 +153,25 @@ def test_every_expert_takes_its_own_task() -> None:
     wall = RegionPrior(Ball(torch.zeros(D), 1.0), "out", sharpness=2.0, task_key=("map", "obstacle"))
     path = TimeIndexedPrior(GoalPrior(std=0.2), torch.randn(9, D))
     prior = ProductPrior(ProductPrior(wall, GoalPrior(std=0.5)), path, GoalPrior(std=2.0))
-    assert prior.in_keys == [("map", "obstacle"), "goal", "step_count"]
+    assert prior.in_keys == [("map", "obstacle"), "task", "step_count"]
     assert prior.task_key is None
     tasks = {
         ("map", "obstacle"): torch.randn(5, 4, D),
-        "goal": torch.randn(5, D),
+        "task": torch.randn(5, D),
         "step_count": torch.tensor([[0], [1], [2], [3], [4]]),
     }
     along = prior.along(tasks, batch_ndim=1, horizon=4)
     assert {key: value.shape[1] for key, value in along.items()} == {
         ("map", "obstacle"): 4,
-        "goal": 1,
+        "task": 1,
         "step_count": 4,
     }
     z = torch.randn(7, 5, 4, D)
     expected = (
         wall.log_prob(z, tasks["map", "obstacle"])
-        + GoalPrior(std=0.5).log_prob(z, tasks["goal"].unsqueeze(1))
+        + GoalPrior(std=0.5).log_prob(z, tasks["task"].unsqueeze(1))
         + path.log_prob(z, along["step_count"])
-        + GoalPrior(std=2.0).log_prob(z, tasks["goal"].unsqueeze(1))
+        + GoalPrior(std=2.0).log_prob(z, tasks["task"].unsqueeze(1))
     )
     got = prior.log_prob(z, along)
     torch.testing.assert_close(differences(got), differences(expected), rtol=1e-3, atol=1e-3)

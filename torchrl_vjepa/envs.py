@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
@@ -21,7 +21,15 @@ from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.belief import PreparedTransition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
-from torchrl_vjepa.imagination import Tasks, check_prior, densities, first_latents, imagine, imagine_fused
+from torchrl_vjepa.imagination import (
+    Tasks,
+    check_prior,
+    densities,
+    first_latents,
+    imagine,
+    imagine_fused,
+    read_state,
+)
 from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
@@ -71,6 +79,7 @@ class LatentEnv(ModelBasedEnvBase):
         prior: of the task; its energy is subtracted from the reward. Of ``reward_model``, ``cost`` and
             ``prior`` at least one must be given; what is given is added up.
         fusion: how the prior enters the cost of a plan; all but ``"energy"`` need sampled trajectories.
+        num_particles: of ``fusion="propose"``, for every step that has no closed form: memory grows with them.
         termination_model: TensorDictModule that reads ``latent_key`` (the next latent) and ``action_key`` and
             writes ``"termination_logit"`` of shape ``(*B, 1)``, the logit of the episode's end
             (:class:`~torchrl_vjepa.objectives.TerminationLoss` trains it). Costs of a plan count as far as it
@@ -136,6 +145,7 @@ class LatentEnv(ModelBasedEnvBase):
         cost: StageCost | None = None,
         prior: Prior | None = None,
         fusion: Literal["energy", "weight", "propose"] = "energy",
+        num_particles: int = 128,
         termination_model: TensorDictModuleBase | None = None,
         termination_cost: float = 0.0,
         how: Literal["mean", "mode", "sample"] = "mean",
@@ -213,6 +223,7 @@ class LatentEnv(ModelBasedEnvBase):
         self.task_keys = [] if prior is None else [unravel_key(key) for key in prior.in_keys]
         self.planning_keys += self.task_keys
         self.how, self.num_samples, self.risk, self.fusion = how, num_samples, risk, fusion
+        self.num_particles = num_particles
         self.constraints: Any = nn.ModuleList(constraints)  # registered: their modules move along
         self.rng: torch.Generator | None = None
         self.rollout_dtype = rollout_dtype
@@ -244,46 +255,7 @@ class LatentEnv(ModelBasedEnvBase):
             KeyError: if an entry is missing.
             ValueError: if its last dimension is not ``D``, or a task lacks the batch dimensions.
         """
-        read = {key: tensordict.get(key, None) for key in self.planning_keys}
-        missing = [key for key, value in read.items() if value is None]
-        if missing:
-            advice = f"put the {'encoder' if self.belief_key is None else 'particle filter'} in front"
-            if missing[0] in self.task_keys:
-                advice = "put the task there, or give the environment prior.bind(task)"
-            got = sorted(map(str, tensordict.keys(True, True)))
-            raise KeyError(f"planning needs the entries {missing}, got a tensordict with {got}; {advice}")
-        start = read[self.planning_keys[0]]
-        if start.shape[-1:] != (self.latent_dim,):
-            lead = "(*B" if self.belief_key is None else "(*B, K"
-            raise ValueError(
-                f"{self.planning_keys[0]!r} must have shape {lead}, {self.latent_dim}), "
-                f"got {tuple(start.shape)}"
-            )
-        state = {"latent": start}
-        batch = start.shape[:-1]
-        if self.belief_key is not None:
-            log_weights = read[self.planning_keys[1]]
-            if log_weights.shape != start.shape[:-1]:
-                raise ValueError(
-                    f"{self.planning_keys[1]!r} must have shape {tuple(start.shape[:-1])}, one for each "
-                    f"particle, got {tuple(log_weights.shape)}"
-                )
-            if not bool(log_weights.logsumexp(-1).isfinite().all()):
-                raise ValueError(
-                    f"{self.planning_keys[1]!r} must hold some weight in every row, got rows that are all "
-                    "zero or nan"
-                )
-            state, batch = {"particles": start, "log_weights": log_weights}, batch[:-1]
-        elif not self.task_keys:
-            return start
-        tasks = {key: read[key] for key in self.task_keys}
-        for key, task in tasks.items():
-            if task.shape[: len(batch)] != batch:
-                raise ValueError(
-                    f"{key!r} must have the batch dimensions {tuple(batch)} in front, as the latent has, got "
-                    f"shape {tuple(task.shape)}; use bind(task) for one that all rows share"
-                )
-        return TensorDict({**state, "tasks": tasks}, batch_size=batch)
+        return read_state(tensordict, self.planning_keys, self.task_keys, self.latent_dim)
 
     def sampling(
         self,
@@ -390,7 +362,9 @@ class LatentEnv(ModelBasedEnvBase):
             tasks = self._tasks(state, actions)
             if given.fusion == "propose":
                 prior_at = densities(world_model.prior, tasks, actions.ndim - 3)
-                latents, evidence = imagine_fused(transition, start, actions, prior_at, generator)
+                latents, evidence = imagine_fused(
+                    transition, start, actions, prior_at, generator, self.num_particles
+                )
                 if actions.requires_grad and not evidence.requires_grad:
                     raise ValueError(NO_GRADIENT)
                 costs = world_model.fused_cost(latents, actions, evidence, tasks)

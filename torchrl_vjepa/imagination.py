@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_vjepa.belief import ParticleBelief, Transition, resampling_index, rollout
@@ -14,7 +14,16 @@ from torchrl_vjepa.common_random_numbers import CommonNoise, common_particle, sa
 from torchrl_vjepa.fusion import fuse
 from torchrl_vjepa.priors import LatentDensity, Prior
 
-__all__ = ["Tasks", "check_prior", "densities", "drawn", "first_latents", "imagine", "imagine_fused"]
+__all__ = [
+    "Tasks",
+    "check_prior",
+    "densities",
+    "drawn",
+    "first_latents",
+    "imagine",
+    "imagine_fused",
+    "read_state",
+]
 
 Tasks = Mapping[NestedKey, Tensor]
 
@@ -60,7 +69,7 @@ def densities(prior: Prior, tasks: Tasks | None, time_dim: int) -> Callable[[int
     Examples:
         >>> import torch
         >>> from torchrl_vjepa import GoalPrior
-        >>> path = {"goal": torch.arange(3.0).reshape(1, 3, 1)}  # (*B, H, D)
+        >>> path = {"task": torch.arange(3.0).reshape(1, 3, 1)}  # (*B, H, D)
         >>> densities(GoalPrior(std=1.0), path, time_dim=1)(2).mean
         tensor([[2.]])
     """
@@ -98,6 +107,70 @@ def drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator |
     ).unsqueeze(-1)
     particles = belief.get("particles")
     return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
+
+
+def read_state(
+    tensordict: TensorDictBase, keys: list[NestedKey], task_keys: list[NestedKey], latent_dim: int
+) -> Tensor | TensorDictBase:
+    """What planning starts from: the entries of a tensordict, checked.
+
+    Args:
+        tensordict: holds the entries.
+        keys: the latent, or particles and log weights of a belief; then the tasks.
+        task_keys: which of them are tasks.
+        latent_dim: ``D``.
+
+    Returns:
+        See :meth:`~torchrl_vjepa.envs.LatentEnv.planning_state`.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if its last dimension is not ``D``, or a task lacks the batch dimensions.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict(latent=torch.zeros(5, 2), goal=torch.ones(5, 3), batch_size=[5])
+        >>> read_state(td, ["latent", "goal"], ["goal"], 2)["tasks", "goal"].shape
+        torch.Size([5, 3])
+    """
+    own = [key for key in keys if key not in task_keys]
+    read = {key: tensordict.get(key, None) for key in keys}
+    missing = [key for key, value in read.items() if value is None]
+    if missing:
+        advice = f"put the {'encoder' if len(own) == 1 else 'particle filter'} in front"
+        if missing[0] in task_keys:
+            advice = "put the task there, or give the environment prior.bind(task)"
+        got = sorted(map(str, tensordict.keys(True, True)))
+        raise KeyError(f"planning needs the entries {missing}, got a tensordict with {got}; {advice}")
+    start = read[keys[0]]
+    if start.shape[-1:] != (latent_dim,):
+        lead = "(*B" if len(own) == 1 else "(*B, K"
+        raise ValueError(f"{keys[0]!r} must have shape {lead}, {latent_dim}), got {tuple(start.shape)}")
+    state = {"latent": start}
+    batch = start.shape[:-1]
+    if len(own) > 1:
+        log_weights = read[keys[1]]
+        if log_weights.shape != start.shape[:-1]:
+            raise ValueError(
+                f"{keys[1]!r} must have shape {tuple(start.shape[:-1])}, one for each "
+                f"particle, got {tuple(log_weights.shape)}"
+            )
+        if not bool(log_weights.logsumexp(-1).isfinite().all()):
+            raise ValueError(
+                f"{keys[1]!r} must hold some weight in every row, got rows that are all zero or nan"
+            )
+        state, batch = {"particles": start, "log_weights": log_weights}, batch[:-1]
+    elif not task_keys:
+        return start
+    tasks = {key: read[key] for key in task_keys}
+    for key, task in tasks.items():
+        if task.shape[: len(batch)] != batch:
+            raise ValueError(
+                f"{key!r} must have the batch dimensions {tuple(batch)} in front, as the latent has, got "
+                f"shape {tuple(task.shape)}; use bind(task) for one that all rows share"
+            )
+    return TensorDict({**state, "tasks": tasks}, batch_size=batch)
 
 
 def first_latents(
@@ -185,6 +258,7 @@ def imagine_fused(
     actions: Tensor,
     prior_at: Callable[[int], LatentDensity],
     generator: torch.Generator | None,
+    num_particles: int = 128,
 ) -> tuple[Tensor, Tensor]:
     r"""Trajectories drawn from the fused transition, and what corrects for it.
 
@@ -199,6 +273,7 @@ def imagine_fused(
         actions: of shape ``(M, *B, N, H, A)``.
         prior_at: step ``k`` -> the density of the next latent, batch broadcasting against ``(M, *B, N)``.
         generator: source of randomness; trajectories share their noise across all but the first dimension.
+        num_particles: of every fusion that has no closed form; the memory grows with them.
 
     Returns:
         Next latents ``(M, *B, N, H, D)``, and :math:`\log c_k` of shape ``(M, *B, N, H)``.
@@ -217,7 +292,15 @@ def imagine_fused(
     latent = start
     latents, evidence = [], []
     for k, action in enumerate(actions.unbind(-2)):
-        fusion = fuse(transition(latent, action), prior_at(k), generator=generator, shared_noise=True)
+        # Quiet: a plan without evidence has an infinite cost, of which the planner tells.
+        fusion = fuse(
+            transition(latent, action),
+            prior_at(k),
+            num_particles=num_particles,
+            generator=generator,
+            shared_noise=True,
+            quiet=True,
+        )
         posterior, log_evidence = fusion.posterior, fusion.log_evidence
         if isinstance(posterior, ParticleBelief):
             index = common_particle(posterior, generator=generator).unsqueeze(-1)

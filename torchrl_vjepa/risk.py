@@ -490,4 +490,6 @@ def plan_cost(
         rejected = rejected | (excess > 0)
         order = order + excess + 1e-4 * violations.to(value.dtype).mean(dim=(0, -1))
     value = torch.where(rejected, REJECTED_COST * order, value)
-    return torch.where(costs.isfinite().all(dim=0), value, math.inf)
+    # A trajectory that is sure to fail is no fault where the logarithm of an average of chances is taken.
+    sound = ~(costs.isnan() | costs.isneginf()) if risk is free_energy else costs.isfinite()
+    return torch.where(sound.all(dim=0), value, math.inf)

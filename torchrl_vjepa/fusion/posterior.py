@@ -150,6 +150,7 @@ def fuse(
     num_particles: int = 128,
     generator: torch.Generator | None = None,
     shared_noise: bool = False,
+    quiet: bool = False,
 ) -> Fusion:
     r"""Posterior :math:`p(Z)\, p_{\text{prior}}(Z) / \mathcal Z` and evidence :math:`\mathcal Z`.
 
@@ -184,6 +185,7 @@ def fuse(
             (:func:`~torchrl_vjepa.common_random_numbers.sample_common`), so that rows differ by what is
             compared and not by luck. Distributions that are no transform of normal noise are drawn
             independently.
+        quiet: no warnings: the caller looks at the evidence, which tells.
 
     Returns:
         Posterior, log evidence and effective sample size.
@@ -229,7 +231,7 @@ def fuse(
         )
     value = value.expand(particles.shape[:-1]).movedim(0, -1)
     particles = particles.movedim(0, -2)
-    log_weights, log_normaliser = _weigh(particles, before, value)
+    log_weights, log_normaliser = _weigh(particles, before, value, quiet)
     posterior: ParticleBelief
     if isinstance(proposal, ParticleBelief) and not isinstance(proposal, FusedBelief):
         posterior = ParticleBelief(particles, log_weights, validate_args=False)
@@ -332,7 +334,7 @@ def _draw(
     return particles, weight
 
 
-def _weigh(particles: Tensor, before: Tensor, log_factor: Tensor) -> tuple[Tensor, Tensor]:
+def _weigh(particles: Tensor, before: Tensor, log_factor: Tensor, quiet: bool) -> tuple[Tensor, Tensor]:
     """Log weights ``(*B, K)`` and log evidence ``(*B)``; faults as :func:`fuse` says."""
     log_weights = before + log_factor
     log_evidence = log_weights.logsumexp(-1)
@@ -343,16 +345,21 @@ def _weigh(particles: Tensor, before: Tensor, log_factor: Tensor) -> tuple[Tenso
         raise ValueError("p must give finite latents, got NaN or infinite particles")
     log_weights = torch.where(log_weights.isnan() | log_weights.isposinf(), -math.inf, log_weights)
     dead = (log_weights == -math.inf).all(-1)
+    if not quiet:
+        _warn(dead)
+    # Replaced before the sum: its gradient at minus infinity alone would be nan.
+    log_weights = torch.where(dead.unsqueeze(-1), before, log_weights)
+    return log_weights, torch.where(dead, -math.inf, log_weights.logsumexp(-1))
+
+
+def _warn(dead: Tensor) -> None:
     warnings.warn(
         f"the prior gives {int(dead.sum())} of {dead.numel()} rows no weight at all (they fall back to the "
         "unweighted particles), or a weight is nan or inf (it counts as zero): more particles or a smoother "
         "prior help where the prediction hardly reaches the prior; check the task",
         RuntimeWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
-    # Replaced before the sum: its gradient at minus infinity alone would be nan.
-    log_weights = torch.where(dead.unsqueeze(-1), before, log_weights)
-    return log_weights, torch.where(dead, -math.inf, log_weights.logsumexp(-1))
 
 
 def _like(p: Distribution | GaussianFactor) -> Tensor | NoiseDistribution:

@@ -66,7 +66,7 @@ class GoalPrior(Prior):
         *,
         std: Tensor | float | None = None,
         frozen: bool = True,
-        task_key: NestedKey = "goal",
+        task_key: NestedKey = "task",
         task_ndim: int = 1,
         latent_dim: int | None = None,
     ) -> None:

@@ -62,7 +62,7 @@ class ProductPrior(Prior):
         (tensor([0.7500, 0.7500]), tensor([0.2500, 0.2500]))
         >>> wall = RegionPrior(Ball(torch.zeros(2), 1.0), "out", sharpness=10.0, task_key="obstacle")
         >>> ProductPrior(both, wall).in_keys
-        ['goal', 'obstacle']
+        ['task', 'obstacle']
     """
 
     priors: nn.ModuleList
