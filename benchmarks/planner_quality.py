@@ -95,7 +95,12 @@ VARIANTS: dict[str, tuple[type, dict[str, Any]]] = {
     "MPPI, best": (MPPI, {"output": "best"}),
     "MPPI, cold": (MPPI, {"warm_start": False}),
 }
-GRID = ((8, 64, 1), (8, 64, 2), (8, 64, 4), (8, 256, 1), (8, 256, 2), (8, 256, 4), (8, 512, 7), (15, 512, 4))
+GRID = (
+    *((8, 64, rounds) for rounds in (1, 2, 4)),
+    *((8, 256, rounds) for rounds in (1, 2, 3, 4)),
+    *((8, 512, rounds) for rounds in (2, 3, 4, 7)),
+    (15, 512, 4),
+)
 
 
 def contenders() -> Iterator[Contender]:

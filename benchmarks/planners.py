@@ -4,8 +4,11 @@ Everything plans over the same network and cost with the same candidates, horizo
 process, on one thread, in turn; time is processor time, and a ratio is the median of the ratios within the
 rounds. Before anything is timed, the plans are compared: the floor (a hand-written loop, sampling included)
 must give the very plan of the library, TorchRL's planners the same optimum. "products" are the matrix
-products of a plan alone. With "one by one", environments are planned for one after another. pytorch_mppi
-joins where it is installed (pip install pytorch_mppi; it is no dependency), for one environment.
+products of a plan alone. With "one by one", environments are planned for one after another; "chunked"
+imagines a quarter of the candidates at a time, "bf16" has LatentEnv(rollout_dtype=torch.bfloat16), "short"
+three quarters of the iterations besides (see planner_quality.py for what that costs), "compiled" the default
+torch.compile; all against the full floor. pytorch_mppi joins where it is installed (pip install
+pytorch_mppi; it is no dependency), for one environment.
 """
 
 from __future__ import annotations
@@ -46,6 +49,10 @@ PLANNERS = (
     "CEM",
     "MPPI",
     "CEM one by one",
+    "CEM chunked",
+    "CEM bf16",
+    "CEM bf16 short",
+    "CEM compiled",
     "TorchRL CEM",
     "TorchRL MPPI",
     "pytorch_mppi",
@@ -67,7 +74,10 @@ class Settings:
     sizes: list[str] = option(list(SIZES), "sizes of the problem", choices=list(SIZES))
     num_envs: list[int] = option([1, 16, 256], "environments that are planned for at once")
     planners: list[str] = option(
-        list(PLANNERS), "what is measured; floors always are", choices=list(PLANNERS), metavar="PLANNER"
+        [name for name in PLANNERS if name != "CEM compiled"],  # takes half a minute to compile
+        "what is measured; floors always are",
+        choices=list(PLANNERS),
+        metavar="PLANNER",
     )
     optim_steps: int = option(4, "iterations of a plan")
     rounds: int = option(9, "interleaved rounds, at most")
@@ -105,12 +115,17 @@ class Problem:
                 self.predictor.trunks[0][layer].weight.mul_(2.0)
         self.goal = torch.randn(latent)
         self.start = torch.randn(num_envs, latent)
-        self.env = LatentEnv(
+        self.env = self.make_env()
+        self.inputs = torch.randn(num_envs * self.candidates, latent + self.action)
+
+    def make_env(self, **kwargs: Any) -> LatentEnv:
+        """The network and the cost as an environment."""
+        return LatentEnv(
             self.predictor,
             action_spec=Bounded(-BOUND, BOUND, (self.action,)),
             cost=quadratic_cost(self.goal) + EFFORT * action_cost(),
+            **kwargs,
         )
-        self.inputs = torch.randn(num_envs * self.candidates, latent + self.action)
 
     @property
     def multiplications(self) -> float:
@@ -139,7 +154,7 @@ class Problem:
         if cls is MPPI:
             kwargs = {"temperature": TEMPERATURE, **kwargs}
         return cls(
-            self.env,
+            kwargs.pop("env", self.env),
             self.horizon,
             optim_steps or self.optim_steps,
             self.candidates,
@@ -197,6 +212,9 @@ class Problem:
             planner = self.ours(CEM)
             rows = [slice(row, row + 1) for row in range(self.num_envs)]
             return None if len(rows) == 1 else lambda: [planner(self.data(row)) for row in rows]
+        if name.startswith("CEM "):
+            planner = self.lever(name.removeprefix("CEM "))
+            return lambda: planner(self.data())
         if name.startswith("TorchRL"):
             stock = self.theirs(name)
             return lambda: stock(self.data())
@@ -208,6 +226,15 @@ class Problem:
             return lambda: floor.products(self.start, self.inputs)
         generator = torch.Generator().manual_seed(self.seed)
         return lambda: floor.plan(self.start, generator)
+
+    def lever(self, name: str) -> CEM | MPPI:
+        """The library's CEM with what makes it cheaper."""
+        if name == "chunked":
+            return self.ours(CEM, chunk_size=self.candidates // 4)
+        if name == "compiled":
+            return self.ours(CEM, compile=True)
+        rounds = max(1, 3 * self.optim_steps // 4) if name == "bf16 short" else None
+        return self.ours(CEM, rounds, env=self.make_env(rollout_dtype=torch.bfloat16))
 
     def check(self) -> None:
         """The floor gives the library's plan, TorchRL's planners an action of the same cost."""

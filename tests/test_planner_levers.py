@@ -313,5 +313,22 @@ class TestCompile:
             planner(states())
 
 
+@pytest.mark.parametrize("size", [3, 40])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["none", "number", "diagonal", "matrix"])
+def test_quadratic_costs_are_the_formula(size: int, dtype: torch.dtype, kind: str) -> None:
+    latent, action, target = torch.randn(2, 5, size, dtype=dtype), torch.randn(2, 5, 2), torch.randn(size)
+    diagonal = torch.rand(size)
+    matrix = {"none": torch.eye(size), "number": 2.5 * torch.eye(size)}.get(kind, diagonal.diag())
+    if kind == "matrix" and dtype == torch.float64:
+        pytest.skip("matrices have the dtype of the latent")
+    weight = {"none": None, "number": 2.5, "diagonal": diagonal, "matrix": matrix}[kind]
+    error = (latent - target).double()
+    expected = torch.einsum("abi,ij,abj->ab", error, matrix.double(), error)
+    cost = quadratic_cost(target, weight)(latent, action)
+    assert cost.dtype == dtype
+    torch.testing.assert_close(cost.double(), expected, atol=1e-4, rtol=1e-5)
+
+
 def test_mlp_is_what_the_predictor_is_made_of() -> None:
     assert type(Predictor(3, trunk="mlp").trunks[0]) is MLP

@@ -123,10 +123,11 @@ def _quadratic_form(value: Tensor, weight: Tensor) -> Tensor:
 def _weighted_squares(squares: Tensor, weight: Tensor) -> Tensor:
     """Sum over the last dimension, weighted by a number or a diagonal."""
     size = squares.shape[-1]
-    # torch sums short rows several times more slowly than it multiplies them; products promote no dtypes.
-    if size <= 16 and weight.dtype == squares.dtype:
-        return squares @ weight.expand(size)
-    if weight.ndim == 0:
+    number = weight.ndim == 0  # which takes the dtype of what it multiplies
+    if size <= 16 and (number or weight.dtype == squares.dtype):
+        # torch sums short rows several times more slowly than it multiplies them.
+        return squares @ weight.to(squares.dtype).expand(size)
+    if number:
         return weight * squares.sum(dim=-1)
     return (squares * weight).sum(dim=-1)
 

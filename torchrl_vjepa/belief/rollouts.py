@@ -162,7 +162,14 @@ class PreparedTransition:
 
     @classmethod
     def of(cls, transition: Transition) -> PreparedTransition:
-        """The same, where it is one already."""
+        """The transition itself, where it is prepared already.
+
+        Args:
+            transition: any transition, or a prepared one.
+
+        Returns:
+            A prepared transition.
+        """
         return transition if isinstance(transition, cls) else cls(transition)
 
     def __call__(self, latent: Tensor, action: Tensor) -> Distribution:

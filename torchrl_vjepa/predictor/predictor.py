@@ -300,7 +300,8 @@ class Predictor(PredictiveModel):
                 hooked = layer._forward_hooks or layer._forward_pre_hooks
                 steps.append(layer if hooked else layer.forward)
                 continue
-            weight, bias = layer.weight, layer.bias
+            weight: Tensor = layer.weight
+            bias: Tensor | None = layer.bias
             if place == 0 and self.trunk == "mlp":
                 constant = weight.select(1, size + max(self.skips) * action_dim + index)
                 bias = constant if bias is None else bias + constant

@@ -32,7 +32,7 @@ def linear_and_others(trunk: nn.Module) -> list[Any] | None:
         return [trunk]
     if type(trunk) is not MLP or trunk._forward_hooks or trunk._forward_pre_hooks:
         return None
-    layers = list(trunk)
+    layers: list[Any] = list(trunk._modules.values())  # children() leaves out what comes twice
     if not (layers and is_plain_linear(layers[0]) and is_plain_linear(layers[-1])):
         return None
     for layer in layers[1:-1]:
