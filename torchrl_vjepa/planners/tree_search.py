@@ -186,6 +186,7 @@ class TreeSearch(DiscretePlanner):
         if self.output == "best":
             found = search.best_cost.isfinite().unsqueeze(-1)
             actions = torch.where(found, search.best, actions)
+        shares = shares.to(self.choices.dtype)
         mean = shares @ self.choices
         std = (shares @ self.choices.square() - mean.square()).clamp_min(0).sqrt()
         visits, finite = tree.visits[:, 0], tree.finite[:, 0]
