@@ -27,8 +27,8 @@ from torchrl.data import (
     TensorSpec,
     Unbounded,
 )
-from torchrl.envs import EnvBase
-from torchrl.modules import OneHotCategorical
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.modules import OneHotCategorical, get_env_transforms_from_module
 from torchrl.modules.mcts import EXP3Score, PUCTScore, UCBScore
 
 from torchrl_vjepa import GoalPrior
@@ -497,6 +497,15 @@ class TestModels:
             # One step out of the area, and nothing after it.
             plan = planner.plan(state, planner.family.around(torch.eye(3)[torch.tensor([[0, 1, 2, 1]])], 0.3))
             assert plan.best_cost <= 4.5**2 + 9.0
+
+    def test_it_acts_in_torchrl(self) -> None:
+        env = Walk()
+        planner = TreeSearch(env, 3, 20, seed=0)
+        real = TransformedEnv(Walk(), Compose(*get_env_transforms_from_module(planner)))
+        start = real.reset().set("position", torch.tensor([2.0, -2.0]))
+        data = real.rollout(6, planner, auto_reset=False, tensordict=start)
+        assert data["next", "position"][-1].abs().sum() <= 1
+        assert torch.equal(data["plan"][1:], data["next", "plan"][:-1])
 
     def test_heads_as_tensordict_modules(self) -> None:
         value = TensorDictModule(lambda z: value_of(z).unsqueeze(-1), ["latent"], ["state_value"])

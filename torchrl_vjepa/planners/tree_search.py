@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDict
@@ -22,7 +22,7 @@ from torchrl_vjepa.planners.search_tree import SearchTree
 
 __all__ = ["TreeSearch"]
 
-Head = Callable[[Tensor], Tensor] | TensorDictModuleBase
+Head: TypeAlias = "Callable[[Tensor], Tensor] | TensorDictModuleBase"
 
 
 class TreeSearch(DiscretePlanner):
@@ -50,9 +50,9 @@ class TreeSearch(DiscretePlanner):
 
     **The plan** is the principal variation: the most visited actions, from the root on; of equal visits, the
     action of the best value; its last action repeated to the horizon. ``output="best"`` gives the cheapest
-    simulation instead, for a model that is trusted: it never gets worse with more simulations, keeps a perfect
-    warm start, and is the better plan where simulations are few. Visits average over what a branch may cost,
-    and settle slowly between branches that are nearly equal.
+    simulation instead, for a model that is trusted: it never gets worse with more simulations, keeps a
+    perfect warm start, and is the better plan where simulations are few. Visits average over what a branch
+    may cost, and settle slowly between branches that are nearly equal.
 
     **Warm start**: the plan of the step before is the first simulation, and stays in the tree, state by
     state. The tree itself is not carried over: memory between steps is in the tensordict, and a tree's states
@@ -196,9 +196,16 @@ class TreeSearch(DiscretePlanner):
         value = -(finite * tree.mean[:, 0]).sum(dim=-1) / finite.sum(dim=-1)
         plan, best = self._coded(actions), self._coded(search.best)
         statistics = {"visits": visits, "value": value.unsqueeze(-1)}
+
+        def shaped(part: Tensor) -> Tensor:
+            return part.reshape((*batch, *part.shape[1:]))
+
         return Plan(
-            *(part.reshape((*batch, *part.shape[1:])) for part in (plan, std, best, search.best_cost)),
-            {name: part.reshape((*batch, *part.shape[1:])) for name, part in statistics.items()},
+            shaped(plan),
+            shaped(std),
+            shaped(best),
+            shaped(search.best_cost),
+            {name: shaped(part) for name, part in statistics.items()},
         )
 
 
