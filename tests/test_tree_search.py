@@ -460,6 +460,13 @@ class TestModels:
         env = make_env(termination_model=head, termination_cost=2.0)
         self.check(env, TensorDict(latent=latents(*batch), batch_size=batch))
 
+    def test_a_value_counts_as_far_as_it_is_reached(self) -> None:
+        head = TensorDictModule(lambda z: 50 * (z[..., :1] + 10), ["latent"], ["termination_logit"])
+        env = make_env(termination_model=head)  # every first step is the last
+        planner = TreeSearch(env, 3, 10, leaf_value=lambda z: 100 + z[..., 0], seed=0)
+        plan = planner.plan(latents(2), cold(planner, 2))
+        torch.testing.assert_close(plan.best_cost, brute_force(env, latents(2), 1)[0])
+
     @pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
     @pytest.mark.parametrize("steps", [None, 4])
     def test_tasks_by_row_and_by_step(self, batch: tuple[int, ...], steps: int | None) -> None:
@@ -600,6 +607,18 @@ class TestPromises:
         for row in range(4):
             assert torch.equal(action([row])[0], together[row])
 
+    def test_a_cold_row_is_offered_no_plan(self) -> None:
+        env = make_env(cost=lambda latent, action: -action[..., 0])  # the first action is the best
+        planner = TreeSearch(
+            env, 4, 1, seed=0, prior_policy=lambda z: z.new_tensor([-9.0, 9, 0]).expand(len(z), 3)
+        )
+        start, warm = cold(planner, 2), planner.family.around(torch.eye(3)[2].expand(2, 4, 3), 0.3)
+        row = torch.tensor([True, False])[:, None, None]
+        mixed = Proposal(*(torch.where(row, a, b) for a, b in zip(warm, start, strict=True)))
+        alone = planner.plan(latents(2)[1:], cold(planner, 1))
+        together = planner.plan(latents(2), mixed)
+        assert alone.best_cost == together.best_cost[1] == 0
+
     def test_a_perfect_plan_is_kept(self) -> None:
         env = make_env()
         best = brute_force(env, latents(8), 6)[1].float()
@@ -687,9 +706,10 @@ class TestPromises:
                 assert td["next", "plan"].isfinite().all()
                 td = td["next"].set("latent", latents(3).to(dtype))
 
-    def test_a_branch_of_infinities_is_left(self) -> None:
+    @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf])
+    def test_a_branch_of_faults_is_left(self, fault: float) -> None:
         def cost(latent: Tensor, action: Tensor) -> Tensor:
-            return torch.where(action[..., 0] > 0.5, math.nan, bumpy(latent, action))
+            return torch.where(action[..., 0] > 0.5, fault, bumpy(latent, action))
 
         env = make_env(cost=cost)
         planner = TreeSearch(env, 3, 200, seed=0)
