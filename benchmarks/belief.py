@@ -14,7 +14,6 @@ import json
 import math
 import statistics
 import time
-import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -23,10 +22,8 @@ import matplotlib as mpl
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
-from torch.utils.weak import WeakIdKeyDictionary
 
+from _memory import peak
 from torchrl_vjepa import ParticleBelief, ParticleFilter, Predictor, propagate_moments, rollout
 from torchrl_vjepa.distributions import soft_clamp
 
@@ -35,38 +32,6 @@ SIZES = {"batch": 32, "latent": 8, "horizon": 8, "samples": 32, "particles": 100
 # The batch where a case is compared: as many rows as a planner imagines at once.
 BATCH = {"rollout_mean": 4096, "rollout_sample": 128, "moments_linearize": 256, "moments_sigma_points": 256}
 WIDTH, ACTION, OBSERVATION = 256, 2, 16
-
-
-class PeakMemory(TorchDispatchMode):
-    """Bytes of all storages that are made inside and alive at once, at their peak."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.live = self.peak = 0
-        self.seen = WeakIdKeyDictionary()
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run an operation and count what it made."""
-        out = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(out):
-            if isinstance(leaf, Tensor):
-                storage = leaf.untyped_storage()
-                if storage not in self.seen:
-                    self.seen[storage] = size = storage.nbytes()
-                    self.live += size
-                    self.peak = max(self.peak, self.live)
-                    weakref.finalize(storage, self._free, size)
-        return out
-
-    def _free(self, size: int) -> None:
-        self.live -= size
-
-
-def peak(call: Call) -> int:
-    """Peak bytes of a call."""
-    with torch.no_grad(), PeakMemory() as memory:
-        call()
-    return memory.peak
 
 
 class Problem:

@@ -7,25 +7,36 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 from torchrl.data import Bounded, Unbounded
+from torchrl.envs import RewardScaling, TransformedEnv
 
 from torchrl_vjepa import (
     CEM,
     MPPI,
+    ChanceConstraint,
+    EnergyPrior,
+    FusedPredictor,
     GaussianPrior,
+    GradientMPC,
+    HalfSpace,
     LatentEnv,
+    ParticleFilter,
+    Predictor,
     Prior,
     ProbedPrior,
     ProductPrior,
+    PseudoLikelihood,
     RandomShooting,
+    RegionPrior,
     trajectory_prior,
 )
 from torchrl_vjepa.costs import action_cost, prior_cost, quadratic_cost
 from torchrl_vjepa.distributions import Density, diag_gaussian
 from torchrl_vjepa.priors import LatentDensity, Task
-from torchrl_vjepa.risk import cvar, entropic, free_energy
+from torchrl_vjepa.risk import REJECTED_COST, cvar, entropic, free_energy
 
 A_MATRIX = torch.tensor([[0.9, 0.2], [-0.2, 0.9]], dtype=torch.float64)
 B_MATRIX = torch.tensor([[1.0], [0.5]], dtype=torch.float64)
@@ -364,3 +375,133 @@ def test_free_energy_is_entropic_with_an_aversion_of_minus_one() -> None:
     torch.testing.assert_close(free_energy(costs), -entropic(1.0)(-costs))
     assert (free_energy(costs) < costs.mean(0)).all()
     torch.testing.assert_close(free_energy(costs + 1e4), free_energy(costs) + 1e4)
+
+
+class TestNothingIsIgnored:
+    """What would give a wrong plan without a word."""
+
+    def test_a_fused_predictor_is_the_transition_itself(self) -> None:
+        fused = FusedPredictor(Predictor(2, action_dim=1), GaussianPrior(2, mean=5.0, std=1e-3))
+        env = LatentEnv(fused, action_spec=Bounded(-2, 2, (1,)), cost=quadratic_cost(torch.full((2,), 5.0)))
+        assert env.objective(torch.zeros(2), torch.zeros(1, 1, 1)) < 1e-3
+        filter = ParticleFilter(fused, PseudoLikelihood(lambda x: diag_gaussian(x, torch.ones(1))))
+        assert filter.transition == fused.dist
+
+    def test_constraints_look_at_the_dynamics_and_not_at_the_fused_trajectories(self) -> None:
+        """The prior pulls its trajectories out of what half of the real ones run into."""
+        wall = RegionPrior(HalfSpace(torch.tensor([1.0, 0.0]), 0.0), "in", sharpness=50.0).double()
+        env = make_env(wall, how="sample", num_samples=400)
+        constraint = ChanceConstraint(wall.violated, delta=0.1)
+        state, actions = torch.zeros(2, dtype=torch.float64), torch.zeros(1, 1, 1, dtype=torch.float64)
+        for fusion in ("energy", "weight", "propose"):
+            generator = torch.Generator().manual_seed(0)
+            cost = env.objective(state, actions, constraints=[constraint], fusion=fusion, generator=generator)
+            assert (cost >= REJECTED_COST).all(), fusion
+
+    @pytest.mark.parametrize("cost", [None, action_cost()])
+    def test_both_posterior_routes_agree_where_episodes_end(self, cost: Any) -> None:
+        network = torch.nn.Linear(2, 1).double()
+        end = TensorDictModule(network, ["latent"], ["termination_logit"])
+        with torch.no_grad():
+            network.weight.fill_(2.0)
+            network.bias.zero_()
+        env = make_env(
+            GaussianPrior(2, mean=0.5, std=0.5).double(),
+            cost=cost,
+            termination_model=end,
+            termination_cost=0.5,
+        )
+        state, actions = torch.zeros(2, dtype=torch.float64), 0.3 * torch.ones(1, 3, 1, dtype=torch.float64)
+        weight, propose = (
+            torch.stack(
+                [
+                    env.objective(state, actions, num_samples=4000, fusion=fusion, generator=generator)
+                    for generator in [torch.Generator().manual_seed(0)]
+                    for _ in range(10)
+                ]
+            )
+            for fusion in ("weight", "propose")
+        )
+        error = ((weight.var() + propose.var()) / 10).sqrt()
+        assert (weight.mean() - propose.mean()).abs() < 4 * error, (weight.mean(), propose.mean(), error)
+
+    def test_bound_goals_of_several_rows_are_refused(self) -> None:
+        """With as many rows as steps they would pass for a path."""
+        with pytest.raises(ValueError, match="prior without a task must be one for all latents"):
+            make_env(Well().bind(torch.zeros(3, 2, dtype=torch.float64)))
+
+    @pytest.mark.parametrize("fusion", ["energy", "weight", "propose"])
+    def test_an_energy_without_gradient_is_refused_beside_a_cost_that_has_one(self, fusion: Any) -> None:
+        step = EnergyPrior(lambda z: (z[..., 0] < 0.5).to(z.dtype))
+        env = make_env(step, cost=action_cost())
+        td = TensorDict(latent=torch.zeros(2, dtype=torch.float64))
+        planner = GradientMPC(env, 2, 3, seed=0, fusion=fusion, num_samples=4)
+        with pytest.raises(ValueError, match="prior must have a gradient"):
+            planner(td)
+        CEM(env, 2, 2, num_candidates=16, seed=0)(td)
+        declared = EnergyPrior(lambda z: (z[..., 0] < 0.5).to(z.dtype), latent_dim=2, differentiable=False)
+        with pytest.raises(ValueError, match="differentiable=False, got EnergyPrior"):
+            GradientMPC(make_env(declared, cost=action_cost()), 2)
+
+    def test_a_flat_prior_needs_no_gradient(self) -> None:
+        env = make_env(ProductPrior(), cost=action_cost())
+        GradientMPC(env, 2, 3, seed=0)(TensorDict(latent=torch.zeros(2, dtype=torch.float64)))
+
+    def test_a_gradient_that_is_never_finite_is_told(self) -> None:
+        env = make_env(EnergyPrior(lambda z: (z - 1).square().sum(-1) + (0 * z.sum(-1)).sqrt()))
+        with pytest.warns(RuntimeWarning, match="no finite gradient at any plan in at least one row"):
+            GradientMPC(env, 2, 3, seed=0)(TensorDict(latent=torch.zeros(2, dtype=torch.float64)))
+
+    @pytest.mark.parametrize("route", ["closed form", "importance"])
+    def test_gradients_of_the_proposing_route_are_those_of_the_free_energy(self, route: str) -> None:
+        """Which particle is taken depends on the plan too: without its share they are off by a tenth."""
+        goal = torch.tensor([0.6, -0.3], dtype=torch.float64)
+        prior = Well() if route == "closed form" else EnergyWell()
+        env = make_env(prior.bind(goal))
+        latent = torch.tensor([0.2, 0.4], dtype=torch.float64)
+        actions = torch.full((1, 3, 1), 0.1, dtype=torch.float64).requires_grad_()
+        generator = torch.Generator().manual_seed(0)
+
+        def gradient(value: Tensor) -> Tensor:
+            return torch.autograd.grad(value.sum(), actions)[0].flatten()
+
+        draws = torch.stack(
+            [
+                gradient(
+                    env.objective(latent, actions, generator=generator, num_samples=1000, fusion="propose")
+                )
+                for _ in range(20)
+            ]
+        )
+        exact = gradient(exact_free_energy(latent, actions, goal, 0.5))
+        error = draws.std(0) / len(draws) ** 0.5
+        assert ((draws.mean(0) - exact).abs() < 4 * error + 0.01).all(), (draws.mean(0), exact, error)
+
+    def test_a_transformed_env_keeps_the_tasks(self) -> None:
+        latent = torch.zeros(2, 2, dtype=torch.float64)
+        goals = torch.tensor([[1.0, 0.5], [-1.0, -0.5]], dtype=torch.float64)
+        path = torch.stack([goals, -goals], dim=1)
+        for goal in (goals, path):
+            td = TensorDict(latent=latent, goal=goal, batch_size=[2])
+            plain, stepped = (
+                CEM(env, 2, 3, num_candidates=32, seed=0, warm_start=False)
+                for env in (make_env(Well()), TransformedEnv(make_env(Well()), RewardScaling(0.0, 1.0)))
+            )
+            assert "goal" in stepped.in_keys
+            torch.testing.assert_close(stepped(td.clone())["action"], plain(td.clone())["action"])
+
+    def test_the_proposing_route_reads_the_task_of_each_step(self) -> None:
+        env = make_env(Well())
+        path = torch.tensor([[0.5, 0.2], [-0.5, 0.4], [0.8, -0.6]], dtype=torch.float64)
+        state = env.planning_state(TensorDict(latent=torch.zeros(2, dtype=torch.float64), goal=path))
+        actions, generator = plans((), num=3, horizon=3), torch.Generator().manual_seed(0)
+        draws = torch.stack(
+            [
+                env.objective(state, actions, generator=generator, num_samples=2000, fusion="propose")
+                for _ in range(10)
+            ]
+        )
+        p = joint(torch.zeros(2, dtype=torch.float64), actions)
+        covariance = p.covariance_matrix + 0.5**2 * torch.eye(6, dtype=torch.float64)
+        exact = -MultivariateNormal(p.mean, covariance).log_prob(path.flatten())
+        assert ((draws.mean(0) - exact).abs() < 4 * draws.std(0) / 10**0.5 + 0.5 * draws.var(0) + 1e-3).all()

@@ -283,10 +283,27 @@ def check_fork_report(report: dict[str, Any]) -> None:
     assert all(0.0 <= row["mean_in_wall"] <= 1.0 for row in report["mean_in_wall"])
 
 
+def check_pendulum_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``pendulum.py``: one row for each evaluation, in order, and the references."""
+    assert set(report) == {"settings", "wall_s", "rows", "references"}
+    settings, rows = report["settings"], report["rows"]
+    assert report["wall_s"] > 0
+    step = 200 * settings["collect_episodes"]
+    assert [(row["seed"], row["env_steps"]) for row in rows] == [
+        (seed, steps) for seed in settings["seeds"] for steps in range(step, settings["env_steps"] + 1, step)
+    ]
+    assert all(set(row) == {"seed", "env_steps", "return_mean", "return_min"} for row in rows)
+    assert [row["policy"] for row in report["references"]] == ["true_model", "random"]
+    for row in [*rows, *report["references"]]:
+        # No step pays less than -(pi^2 + 0.1 * 8^2 + 0.001 * 2^2).
+        assert -200 * 16.28 < row["return_min"] <= row["return_mean"] <= 0
+
+
 CHECKS = {
     "fork": check_fork_report,
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,
+    "pendulum": check_pendulum_report,
     "surprise": check_surprise_report,
     "cliff": check_cliff_report,
     "uncertainty": check_uncertainty_report,

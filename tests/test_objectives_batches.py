@@ -326,7 +326,7 @@ BAD_WINDOWS = {
         "'observation' must be floating point, got torch.uint8; convert it first",
     ),
     "integer actions": (
-        lambda: spoilt(action=torch.zeros(4, 6, ACTION, dtype=torch.int64)),
+        lambda: spoilt(action=torch.zeros(4, 6, ACTION + 1, dtype=torch.int64)),
         ValueError,
         "'action' must be floating point, got torch.int64",
     ),

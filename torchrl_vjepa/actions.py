@@ -133,7 +133,8 @@ class ActionCodec(nn.Module):
         """The layout of the code as tensors, which move with the module."""
         sizes = [size for leaf in leaves for size in leaf.sizes]
         widest = max(sizes, default=0)
-        block, choice, members = [0] * self.size, [-1] * self.size, []
+        block, choice = [0] * self.size, [-1] * self.size
+        members: list[list[int]] = []
         position = 0
         for leaf in leaves:
             if leaf.kind in ("number", "bit"):
@@ -266,6 +267,19 @@ class ActionCodec(nn.Module):
                 value = index[..., blocks] + self.offset[blocks]
             out.append(value.to(leaf.dtype).reshape((*batch, *leaf.shape)))
         return out
+
+    def executed(self, code: Tensor) -> list[Tensor]:
+        """As :meth:`decode_leaves`, for what is a code: one continuous tensor is not clamped again.
+
+        Args:
+            code: of shape ``(*B, A)``.
+
+        Returns:
+            One tensor for each of :attr:`keys`.
+        """
+        if self.is_identity:
+            return [code.reshape((*code.shape[:-1], *self.shape))]
+        return self.decode_leaves(code)
 
     def most_probable(self, code: Tensor) -> Tensor:
         """The choice of each block that has the largest number, among those that are allowed.

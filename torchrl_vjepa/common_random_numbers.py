@@ -28,7 +28,7 @@ from torch.distributions import (
 from torchrl_vjepa.belief import ParticleBelief
 from torchrl_vjepa.distributions import Delta, NoiseDistribution, sample
 
-__all__ = ["CommonNoise", "sample_common"]
+__all__ = ["CommonNoise", "common_particle", "sample_common"]
 
 
 @functools.singledispatch
@@ -143,10 +143,8 @@ def _(p: MixtureSameFamily, *, generator: torch.Generator | None = None, own_dim
 
 @sample_common.register
 def _(p: ParticleBelief, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
-    # Particles are taken in their order, which means the same in all rows if their noise was shared.
-    u = _uniform((*_noise_shape(p.batch_shape, own_dims), 1), p.particles, generator)
-    index = (u >= p.weights.cumsum(-1)[..., :-1]).sum(-1)[..., None, None].expand(*p.batch_shape, 1, 1)
-    return torch.take_along_dim(p.particles, index, -2).squeeze(-2)
+    index = common_particle(p, generator=generator, own_dims=own_dims)
+    return torch.take_along_dim(p.particles, index[..., None, None], -2).squeeze(-2)
 
 
 @sample_common.register
@@ -157,6 +155,30 @@ def _(p: TransformedDistribution, *, generator: torch.Generator | None = None, o
     for transform in p.transforms:
         value = transform(value)
     return value
+
+
+def common_particle(
+    p: ParticleBelief, *, generator: torch.Generator | None = None, own_dims: int = 0
+) -> Tensor:
+    """Which particles :func:`sample_common` takes.
+
+    Args:
+        p: batch shape ``(M, *B)``.
+        generator: source of randomness; the global one if ``None``.
+        own_dims: as for :func:`sample_common`.
+
+    Returns:
+        Their index, of shape ``(M, *B)``.
+
+    Examples:
+        >>> import torch
+        >>> heavy = torch.tensor([0.0, -100.0]).expand(3, 2)
+        >>> common_particle(ParticleBelief(torch.zeros(3, 2, 1), heavy))
+        tensor([0, 0, 0])
+    """
+    # Particles are taken in their order, which means the same in all rows if their noise was shared.
+    u = _uniform((*_noise_shape(p.batch_shape, own_dims), 1), p.particles, generator)
+    return (u >= p.weights.cumsum(-1)[..., :-1]).sum(-1).expand(p.batch_shape)
 
 
 class CommonNoise:

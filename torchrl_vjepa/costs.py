@@ -8,6 +8,7 @@ it with the *next* latent :math:`Z_{t+k+1}` and the action :math:`u_{t+k}` that 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -102,16 +103,32 @@ class _WeightedSum(Cost):
                 self.terms.append(term if isinstance(term, nn.Module) else _FunctionCost(term))
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
-        total = self.factors[0] * self.terms[0](latent, action)
-        for factor, term in zip(self.factors[1:], self.terms[1:], strict=True):
-            total = total + factor * term(latent, action)
+        total: Any = None
+        for factor, term in zip(self.factors, self.terms, strict=True):
+            value = term(latent, action)
+            if total is None:
+                total = value if factor == 1.0 else factor * value
+            else:
+                total = torch.add(total, value, alpha=factor)
         return total
 
 
 def _quadratic_form(value: Tensor, weight: Tensor) -> Tensor:
     """``v^T W v`` over the last dimension; ``W`` a number, a diagonal, or a matrix."""
-    weighted = value @ weight if weight.ndim == 2 else value * weight
-    return (weighted * value).sum(dim=-1)
+    if weight.ndim == 2:
+        return ((value @ weight) * value).sum(dim=-1)
+    return _weighted_squares(value.square(), weight)
+
+
+def _weighted_squares(squares: Tensor, weight: Tensor) -> Tensor:
+    """Sum over the last dimension, weighted by a number or a diagonal."""
+    size = squares.shape[-1]
+    # torch sums short rows several times more slowly than it multiplies them; products promote no dtypes.
+    if size <= 16 and weight.dtype == squares.dtype:
+        return squares @ weight.expand(size)
+    if weight.ndim == 0:
+        return weight * squares.sum(dim=-1)
+    return (squares * weight).sum(dim=-1)
 
 
 def _checked_weight(weight: Tensor | float | None, size: int | None) -> Tensor:
@@ -150,7 +167,10 @@ class _QuadraticCost(Cost):
         self.register_buffer("weight", weight)
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
-        return _quadratic_form(latent - self.target, self.weight)
+        if self.weight.ndim == 2:
+            return _quadratic_form(latent - self.target, self.weight)
+        target = self.target.expand_as(latent)
+        return _weighted_squares(F.mse_loss(latent, target, reduction="none"), self.weight)
 
 
 class _ActionCost(Cost):

@@ -7,7 +7,7 @@ better. :class:`LatentEnv` answers both on plain tensors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -18,10 +18,11 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.model_based import ModelBasedEnvBase
 
 from torchrl_vjepa.actions import ActionCodec
+from torchrl_vjepa.belief import PreparedTransition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
-from torchrl_vjepa.imagination import Tasks, check_device, densities, drawn, imagine, imagine_fused
-from torchrl_vjepa.latent_step import LatentStep
+from torchrl_vjepa.imagination import Tasks, check_prior, densities, first_latents, imagine, imagine_fused
+from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 
@@ -94,6 +95,8 @@ class LatentEnv(ModelBasedEnvBase):
         action_key: where the action is, if ``action_spec`` is no ``Composite``, and the name under which
             models read it; by default the model's, else ``"action"``.
         reward_key: where the reward is written.
+        rollout_dtype: what the network computes in while planning, for instance ``torch.bfloat16``; latents
+            and costs keep their dtype. Not for ``fusion="propose"``, which factorises covariances.
         device: by default the one of the model's parameters.
         dtype: of the latent; by default the one of the model's parameters.
 
@@ -144,6 +147,7 @@ class LatentEnv(ModelBasedEnvBase):
         belief_key: NestedKey | None = None,
         action_key: NestedKey | None = None,
         reward_key: NestedKey = "reward",
+        rollout_dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
@@ -151,6 +155,8 @@ class LatentEnv(ModelBasedEnvBase):
             raise ValueError("at least one of reward_model, cost and prior must be given, got none")
         if how not in ("mean", "mode", "sample"):
             raise ValueError(f"how must be 'mean', 'mode' or 'sample', got {how!r}")
+        if rollout_dtype is not None and not rollout_dtype.is_floating_point:
+            raise ValueError(f"rollout_dtype must be a floating point dtype, got {rollout_dtype}")
         sampled = how == "sample" or belief_key is not None
         if num_samples is None:
             num_samples = 1 if belief_key is None else BELIEF_SAMPLES
@@ -160,7 +166,8 @@ class LatentEnv(ModelBasedEnvBase):
                 f"got {num_samples} with how={how!r} and no belief_key"
             )
         Sampling.checked(num_samples if sampled else None, risk, constraints)
-        predictor = getattr(model, "predictor", model)
+        # What is a transition itself comes first: a FusedPredictor has a predictor inside.
+        predictor = model if hasattr(model, "dist") else getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
         if not callable(transition):
             raise TypeError(
@@ -189,15 +196,12 @@ class LatentEnv(ModelBasedEnvBase):
             latent_key=latent_key, action_key=action_key, reward_key=unravel_key(reward_key), prior=prior,
             termination_model=termination_model, termination_cost=termination_cost,
         )  # fmt: skip
-        prior_dim = getattr(prior, "latent_dim", None)
-        if prior_dim not in (None, latent_dim):
-            raise ValueError(f"prior must be over latents of size {latent_dim}, got latent_dim={prior_dim}")
         parameter = next((p for p in world_model.parameters() if p.is_floating_point()), None)
         if device is None:
             device = "cpu" if parameter is None else parameter.device
         if dtype is None:
             dtype = torch.get_default_dtype() if parameter is None else parameter.dtype
-        check_device(prior, torch.device(device))
+        check_prior(prior, latent_dim, torch.device(device))
         super().__init__(world_model, device=device, batch_size=torch.Size([]))
         self.codec = codec.to(self.device)
         self.latent_dim, self.action_dim = latent_dim, action_dim
@@ -211,6 +215,7 @@ class LatentEnv(ModelBasedEnvBase):
         self.how, self.num_samples, self.risk, self.fusion = how, num_samples, risk, fusion
         self.constraints: Any = nn.ModuleList(constraints)  # registered: their modules move along
         self.rng: torch.Generator | None = None
+        self.rollout_dtype = rollout_dtype
         latent_spec = Unbounded((latent_dim,), device=self.device, dtype=dtype)
         self.observation_spec = Composite({self.latent_key: latent_spec}, device=self.device)
         self.state_spec = Composite({self.latent_key: latent_spec.clone()}, device=self.device)
@@ -354,25 +359,54 @@ class LatentEnv(ModelBasedEnvBase):
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
 
         Raises:
-            ValueError: if a shape does not fit, or what is asked for needs samples and has none.
+            ValueError: if a shape does not fit, what is asked for needs samples and has none, or actions
+                require gradients and the energy of the prior gives none.
         """
-        settings = self.sampling(num_samples, risk, constraints, fusion)
-        start, actions = self._start(state, actions, settings.num_samples, generator)
+        evaluate = self.objective_from(
+            state, num_samples=num_samples, risk=risk, constraints=constraints, fusion=fusion
+        )
+        return evaluate(actions, generator)
+
+    def objective_from(
+        self, state: Tensor | TensorDictBase, **settings: Any
+    ) -> Callable[[Tensor, torch.Generator | None], Tensor]:
+        """:meth:`objective` of one planning call: what its rounds share is checked and prepared once.
+
+        Args:
+            state: see :meth:`objective`.
+            **settings: ``num_samples``, ``risk``, ``constraints``, ``fusion``; see :meth:`objective`.
+
+        Returns:
+            ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes.
+        """
+        given = self.sampling(**settings)
+        if given.fusion == "propose" and self.rollout_dtype is not None:
+            raise ValueError(f"rollout_dtype must be None for fusion='propose', got {self.rollout_dtype}")
         world_model = self.world_model
-        if settings.fusion == "propose":
-            prior_at = densities(world_model.prior, self._tasks(state, actions), actions.ndim - 3)
-            latents, evidence = imagine_fused(world_model.transition, start, actions, prior_at, generator)
-            own = world_model.own_cost(latents, actions)
-            costs = -evidence if own is None else own - evidence
-        else:
-            latents = imagine(
-                world_model.transition, start, actions, self._following(state, settings), generator
-            )
-            costs = world_model.stage_cost(latents, actions, self._tasks(state, actions))
-        costs = world_model.until_end(costs, latents, actions).sum(dim=-1)
-        if settings.num_samples is None:
-            return costs
-        return plan_cost(costs, settings.risk, settings.constraints, latents, actions)
+        transition = PreparedTransition(world_model.transition, self.rollout_dtype)
+
+        def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
+            start, actions = self._start(state, actions, given.num_samples, generator)
+            tasks = self._tasks(state, actions)
+            if given.fusion == "propose":
+                prior_at = densities(world_model.prior, tasks, actions.ndim - 3)
+                latents, evidence = imagine_fused(transition, start, actions, prior_at, generator)
+                if actions.requires_grad and not evidence.requires_grad:
+                    raise ValueError(NO_GRADIENT)
+                costs = world_model.fused_cost(latents, actions, evidence, tasks)
+                if given.constraints:  # what violates is what the dynamics do, not what the prior asks for
+                    latents = imagine(transition, start, actions, "sample", generator)
+            else:
+                latents = imagine(transition, start, actions, self._following(state, given), generator)
+                latents, needs_gradient = latents.to(start.dtype), actions.requires_grad
+                costs = world_model.stage_cost(latents, actions, tasks, needs_gradient=needs_gradient)
+                costs = world_model.until_end(costs, latents, actions)
+            costs = costs.sum(dim=-1)
+            if given.num_samples is None:
+                return costs
+            return plan_cost(costs, given.risk, given.constraints, latents, actions)
+
+        return evaluate
 
     def violation_probability(
         self,
@@ -407,33 +441,11 @@ class LatentEnv(ModelBasedEnvBase):
         return torch.stack([constraint(latents, actions) for constraint in settings.constraints], dim=-1)
 
     def _start(
-        self,
-        state: Tensor | TensorDictBase,
-        actions: Tensor,
-        num_samples: int | None,
-        generator: torch.Generator | None,
+        self, state: Tensor | TensorDictBase, actions: Tensor, samples: int | None, rng: Any
     ) -> tuple[Tensor, Tensor]:
-        """First latents ``(*B, N, D)`` and actions ``(*B, N, H, A)``; with ``M`` in front where sampled."""
-        batch, (num_candidates, _, action_dim) = actions.shape[:-3], actions.shape[-3:]
-        if isinstance(state, Tensor):
-            if self.task_keys:
-                raise KeyError(f"state must hold the tasks {self.task_keys} under 'tasks', got a tensor")
-            start = state
-        elif self.belief_key is None:
-            start = state.get("latent")
-        else:
-            start = drawn(state, num_samples or 1, generator)
-        lead = self.belief_key is not None and not isinstance(state, Tensor)
-        if start.shape[lead:] != (*batch, self.latent_dim) or action_dim != self.action_dim:
-            raise ValueError(
-                f"state and actions must have shapes (*B, {self.latent_dim}) and (*B, N, H, "
-                f"{self.action_dim}), got {tuple(start.shape[lead:])} and {tuple(actions.shape)}"
-            )
-        actions = actions.to(start.dtype)
-        if num_samples is not None:
-            actions = actions.expand(num_samples, *actions.shape)
-            start = start if lead else start.expand(num_samples, *start.shape)
-        return start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, self.latent_dim), actions
+        if isinstance(state, Tensor) and self.task_keys:
+            raise KeyError(f"state must hold the tasks {self.task_keys} under 'tasks', got a tensor")
+        return first_latents(state, actions, self.latent_dim, self.action_dim, samples, rng)
 
     def _following(
         self, state: Tensor | TensorDictBase, settings: Sampling

@@ -1,10 +1,10 @@
-"""Random generators in a form that can be sent to other processes."""
+"""Random generators: new ones from old ones, and in a form that can be sent to other processes."""
 
 from __future__ import annotations
 
 import torch
 
-__all__ = ["pack_generator", "unpack_generator"]
+__all__ = ["offspring", "pack_generator", "unpack_generator"]
 
 
 def pack_generator(generator: torch.Generator) -> tuple[str, bytes]:
@@ -45,3 +45,21 @@ def unpack_generator(packed: tuple[str, bytes]) -> torch.Generator:
     generator = torch.Generator(device)
     generator.set_state(torch.frombuffer(bytearray(state), dtype=torch.uint8))
     return generator
+
+
+def offspring(generator: torch.Generator, device: torch.device) -> torch.Generator:
+    """A new generator, seeded by a draw from another.
+
+    Args:
+        generator: the other, which moves on by one number.
+        device: of the new one.
+
+    Returns:
+        The new one.
+
+    Examples:
+        >>> offspring(torch.Generator().manual_seed(0), torch.device("cpu")).device
+        device(type='cpu')
+    """
+    seed = torch.randint(2**62, (), generator=generator, device=generator.device)
+    return torch.Generator(device).manual_seed(int(seed))

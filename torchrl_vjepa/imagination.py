@@ -9,30 +9,35 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from torchrl_vjepa.belief import Transition, resampling_index, rollout
-from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
+from torchrl_vjepa.belief import ParticleBelief, Transition, resampling_index, rollout
+from torchrl_vjepa.common_random_numbers import CommonNoise, common_particle, sample_common
 from torchrl_vjepa.fusion import fuse
 from torchrl_vjepa.priors import LatentDensity, Prior
 
-__all__ = ["Tasks", "check_device", "densities", "drawn", "imagine", "imagine_fused"]
+__all__ = ["Tasks", "check_prior", "densities", "drawn", "first_latents", "imagine", "imagine_fused"]
 
 Tasks = Mapping[NestedKey, Tensor]
 
 
-def check_device(prior: Prior | None, device: torch.device) -> None:
-    """Refuse a prior that lives elsewhere than the model.
+def check_prior(prior: Prior | None, latent_dim: int, device: torch.device) -> None:
+    """Refuse a prior over other latents than the model's, or one that lives elsewhere.
 
     Args:
         prior: the prior, if there is one.
+        latent_dim: size of the model's latent.
         device: of the model.
 
     Raises:
-        ValueError: if a parameter or buffer of the prior is on another device.
+        ValueError: if the sizes differ, or a parameter or buffer of the prior is on another device.
 
     Examples:
         >>> from torchrl_vjepa import GaussianPrior
-        >>> check_device(GaussianPrior(2), torch.device("cpu"))
+        >>> check_prior(GaussianPrior(2), 2, torch.device("cpu"))
     """
+    if prior is not None and prior.latent_dim not in (None, latent_dim):
+        raise ValueError(
+            f"prior must be over latents of size {latent_dim}, got latent_dim={prior.latent_dim}"
+        )
     for tensor in () if prior is None else (*prior.parameters(), *prior.buffers()):
         if tensor.device.type != device.type or device.index not in (None, tensor.device.index):
             raise ValueError(
@@ -93,6 +98,54 @@ def drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator |
     ).unsqueeze(-1)
     particles = belief.get("particles")
     return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
+
+
+def first_latents(
+    state: Tensor | TensorDictBase,
+    actions: Tensor,
+    latent_dim: int,
+    action_dim: int,
+    num_samples: int | None,
+    generator: torch.Generator | None,
+) -> tuple[Tensor, Tensor]:
+    """Where every candidate plan starts, and the plans, both with samples in front.
+
+    Args:
+        state: latents ``(*B, D)``, or what ``LatentEnv.planning_state`` gives.
+        actions: candidate plans, of shape ``(*B, N, H, A)``.
+        latent_dim: ``D``.
+        action_dim: ``A``.
+        num_samples: ``M``; ``None``: no dimension of samples.
+        generator: source of randomness, for beliefs.
+
+    Returns:
+        First latents ``(*B, N, D)`` and actions ``(*B, N, H, A)``; with ``M`` in front where sampled.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+
+    Examples:
+        >>> import torch
+        >>> start, actions = first_latents(torch.zeros(5, 2), torch.zeros(5, 7, 3, 1), 2, 1, 4, None)
+        >>> start.shape, actions.shape
+        (torch.Size([4, 5, 7, 2]), torch.Size([4, 5, 7, 3, 1]))
+    """
+    batch, num_candidates = actions.shape[:-3], actions.shape[-3]
+    lead = not isinstance(state, Tensor) and state.get("particles", None) is not None
+    if isinstance(state, Tensor):
+        start = state
+    else:
+        start = drawn(state, num_samples or 1, generator) if lead else state.get("latent")
+    if start.shape[lead:] != (*batch, latent_dim) or actions.shape[-1] != action_dim:
+        raise ValueError(
+            f"state and actions must have shapes (*B, {latent_dim}) and (*B, N, H, {action_dim}), got "
+            f"{tuple(start.shape[lead:])} and {tuple(actions.shape)}"
+        )
+    actions = actions.to(start.dtype)
+    if num_samples is not None:
+        actions = actions.expand(num_samples, *actions.shape)
+        start = start if lead else start.expand(num_samples, *start.shape)
+    return start.unsqueeze(-2).expand(*start.shape[:-1], num_candidates, latent_dim), actions
 
 
 def imagine(
@@ -165,7 +218,15 @@ def imagine_fused(
     latents, evidence = [], []
     for k, action in enumerate(actions.unbind(-2)):
         fusion = fuse(transition(latent, action), prior_at(k), generator=generator, shared_noise=True)
-        latent = sample_common(fusion.posterior, generator=generator)
+        posterior, log_evidence = fusion.posterior, fusion.log_evidence
+        if isinstance(posterior, ParticleBelief):
+            index = common_particle(posterior, generator=generator).unsqueeze(-1)
+            latent = torch.take_along_dim(posterior.particles, index.unsqueeze(-1), -2).squeeze(-2)
+            # Which particle is taken cannot move with the plan: its probability does (value zero).
+            log_prob = posterior.log_weights.log_softmax(-1).take_along_dim(index, -1).squeeze(-1)
+            log_evidence = log_evidence + log_prob - log_prob.detach()
+        else:
+            latent = sample_common(posterior, generator=generator)
         latents.append(latent)
-        evidence.append(fusion.log_evidence.expand(latent.shape[:-1]))
+        evidence.append(log_evidence.expand(latent.shape[:-1]))
     return torch.stack(latents, dim=-2), torch.stack(evidence, dim=-1)

@@ -13,10 +13,15 @@ from torch.distributions import Distribution
 
 from torchrl_vjepa.belief import Transition
 from torchrl_vjepa.costs import StageCost
-from torchrl_vjepa.distributions import point_estimate
+from torchrl_vjepa.distributions import Density, point_estimate
 from torchrl_vjepa.priors import Prior, Task
 
-__all__ = ["LatentStep"]
+__all__ = ["NO_GRADIENT", "LatentStep"]
+
+NO_GRADIENT = (
+    "prior must have a gradient for actions that require one, got an energy without: is it detached, rounded "
+    "or a comparison? A sampling planner (CEM, MPPI) needs none"
+)
 
 
 class LatentStep(TensorDictModuleBase):
@@ -159,24 +164,32 @@ class LatentStep(TensorDictModuleBase):
             out.set("terminated", end.unsqueeze(-1)).set("done", end.unsqueeze(-1))
         return out.set(self.latent_key, latent).set(self.reward_key, -cost.unsqueeze(-1))
 
-    def stage_cost(self, latent: Tensor, action: Tensor, task: Task = None) -> Tensor:
+    def stage_cost(
+        self, latent: Tensor, action: Tensor, task: Task = None, *, needs_gradient: bool = False
+    ) -> Tensor:
         """Costs of next latents and the actions that led there, all at once.
 
         Args:
             latent: of shape ``(*B, D)``.
             action: flat, of shape ``(*B, A)``.
             task: of the prior, with batch dimensions that broadcast against ``*B``.
+            needs_gradient: whether an energy without a gradient is refused: in a sum with other costs its
+                absence would not be noticed.
 
         Returns:
             Of shape ``(*B)``: the cost, minus the reward, plus the energy of the prior.
 
         Raises:
-            ValueError: if one of them returns another shape.
+            ValueError: if one of them returns another shape, or the energy has no gradient.
         """
         total = self.own_cost(latent, action)
         if self.prior is None:
             return total
         energy = _checked_shape(self.prior.energy(latent, task), latent.shape[:-1], "prior")
+        if needs_gradient and not energy.requires_grad and torch.is_grad_enabled():
+            density = self.prior(task)
+            if not (isinstance(density, Density) and density.is_flat):
+                raise ValueError(NO_GRADIENT)
         return energy if total is None else total + energy
 
     def own_cost(self, latent: Tensor, action: Tensor) -> Any:
@@ -236,6 +249,25 @@ class LatentStep(TensorDictModuleBase):
         alive = torch.cat([torch.ones_like(alive[..., :1]), alive[..., :-1]], dim=-1)
         return alive * (costs + probability * self.termination_cost)
 
+    def fused_cost(self, latent: Tensor, action: Tensor, log_evidence: Tensor, task: Task = None) -> Tensor:
+        """Costs of trajectories that were drawn from the fused transition, as far as an episode lives.
+
+        Args:
+            latent: next latents, of shape ``(*B, H, D)``.
+            action: flat, of shape ``(*B, H, A)``.
+            log_evidence: of every step's fusion, of shape ``(*B, H)``.
+            task: of the prior.
+
+        Returns:
+            Of shape ``(*B, H)``.
+        """
+        if self.termination_model is None:
+            own = self.own_cost(latent, action)
+            return -log_evidence if own is None else own - log_evidence
+        # The draws have met the prior at every step; what is wanted counts it until the end alone.
+        counted = self.until_end(self.stage_cost(latent, action, task), latent, action)
+        return counted - self.prior.energy(latent, task) - log_evidence  # type: ignore[union-attr]
+
     def _reward(self, latent: Tensor, action: Tensor) -> Tensor:
         batch = latent.shape[:-1]
         shaped = action.reshape((*batch, *self.action_shape))
@@ -291,6 +323,13 @@ class LatentStep(TensorDictModuleBase):
             )
         if self.prior is not None and not self.prior.in_keys:  # else there is no task to try it with
             self.stage_cost(latent, action)
+            shape = tuple(self.prior.energy(latent[:1, 0]).shape)
+            if shape != (1,):
+                raise ValueError(
+                    "prior without a task must be one for all latents, got one with batch dimensions: an "
+                    f"energy of shape {shape} for a single latent; tasks of rows or steps are entries of the "
+                    "tensordict"
+                )
         self.own_cost(latent, action)
         if self.termination_model is not None:
             self.termination_probability(latent, action)

@@ -11,7 +11,7 @@ from torchrl_vjepa.belief.particles import (
     systematic_resampling,
 )
 from torchrl_vjepa.belief.pseudo_likelihood import PseudoLikelihood
-from torchrl_vjepa.belief.rollouts import Transition, rollout
+from torchrl_vjepa.belief.rollouts import PreparedTransition, Transition, rollout
 from torchrl_vjepa.belief.surprisal import surprise
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "ParticleBelief",
     "ParticleFilter",
     "PseudoLikelihood",
+    "PreparedTransition",
     "Transition",
     "composition_gap",
     "effective_sample_size",

@@ -157,7 +157,8 @@ class ParticleFilter(TensorDictModuleBase):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        predictor = getattr(model, "predictor", model)
+        # What is a transition itself comes first: a FusedPredictor has a predictor inside.
+        predictor = model if hasattr(model, "dist") else getattr(model, "predictor", model)
         transition = getattr(predictor, "dist", predictor)
         for name, value in (("model", transition), ("likelihood", likelihood)):
             if not callable(value):

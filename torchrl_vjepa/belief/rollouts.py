@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -11,9 +11,10 @@ from torch.distributions import Distribution
 
 from torchrl_vjepa.distributions import point_estimate
 
-__all__ = ["Transition", "check_plan", "rollout"]
+__all__ = ["PreparedTransition", "Transition", "check_plan", "rollout"]
 
 Transition = Callable[[Tensor, Tensor], Distribution]
+PointStep = Callable[[Tensor, Tensor], Tensor]
 
 
 def rollout(
@@ -123,8 +124,89 @@ def _roll(
     how: Literal["mean", "mode", "sample"],
     generator: torch.Generator | None,
 ) -> Tensor:
+    if how != "sample" and latent.numel() and actions.numel():
+        step = PreparedTransition.of(transition).point_step(latent, actions)
+        if step is not None:
+            return _points(step, latent, actions)
     latents = []
     for action in actions.unbind(-2):
         latent = point_estimate(transition(latent, action), how, generator=generator)
         latents.append(latent)
     return torch.stack(latents, dim=-2)
+
+
+class PreparedTransition:
+    """A transition that is iterated several times from latents and actions of the same shape.
+
+    A method ``dist`` whose owner has a ``point_step``, as
+    :class:`~torchrl_vjepa.predictor.Predictor` has, is then prepared once for all rollouts of mean and
+    mode: the weights that it has at the first rollout count.
+
+    Args:
+        transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
+        dtype: what networks compute in: a ``point_step`` by weights of that dtype, others by autocast;
+            ``None``: as they do without.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_vjepa.predictor import Predictor
+        >>> move = PreparedTransition(Predictor(4, action_dim=2).dist)
+        >>> rollout(move, torch.zeros(7, 4), torch.zeros(7, 5, 2)).shape
+        torch.Size([7, 5, 4])
+    """
+
+    def __init__(self, transition: Transition, dtype: torch.dtype | None = None) -> None:
+        self.transition, self.dtype = transition, dtype
+        self._step: PointStep | None = None
+        self._example: tuple[Any, ...] | None = None
+
+    @classmethod
+    def of(cls, transition: Transition) -> PreparedTransition:
+        """The same, where it is one already."""
+        return transition if isinstance(transition, cls) else cls(transition)
+
+    def __call__(self, latent: Tensor, action: Tensor) -> Distribution:
+        """The distribution of the next latent.
+
+        Args:
+            latent: of shape ``(*B, D)``.
+            action: of shape ``(*B, A)``.
+
+        Returns:
+            What the transition returns.
+        """
+        if self.dtype is None:
+            return self.transition(latent, action)
+        with torch.autocast(latent.device.type, self.dtype):
+            return self.transition(latent, action)
+
+    def point_step(self, latent: Tensor, actions: Tensor) -> PointStep | None:
+        """The short way to mean and mode, where the owner of the transition knows one.
+
+        Args:
+            latent: where a rollout starts, of shape ``(*B, D)``.
+            actions: its plan, of shape ``(*B, H, A)``.
+
+        Returns:
+            ``(latent (R, D), action (R, A)) -> (R, D)``, or ``None``.
+        """
+        example = (latent.shape[-1], actions.shape[-1], latent.dtype, actions.dtype, torch.is_grad_enabled())
+        if self._example != example:
+            owner = getattr(self.transition, "__self__", None)
+            prepare = getattr(owner, "point_step", None)
+            self._step = None
+            if prepare is not None and self.transition == getattr(owner, "dist", None):
+                rows = latent.reshape(-1, latent.shape[-1])[:1]
+                self._step = prepare(rows, actions.reshape(-1, actions.shape[-1])[:1], self.dtype)
+            self._example = example
+        return self._step
+
+
+def _points(step: PointStep, latent: Tensor, actions: Tensor) -> Tensor:
+    horizon, action_dim = actions.shape[-2:]
+    rows = latent.reshape(-1, latent.shape[-1])
+    latents = []
+    for action in actions.reshape(len(rows), horizon, action_dim).unbind(1):
+        rows = step(rows, action)
+        latents.append(rows)
+    return torch.stack(latents, dim=1).reshape(*latent.shape[:-1], horizon, -1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,10 @@ class Head(nn.Module):
     broadcasts says so by ``stackable = True``: it is then called with features ``(N, R, F)`` and constants
     ``(N, 1, C)`` of several models at once (:func:`~torchrl_vjepa.stacking.linear`).
 
+    A head whose mean and mode are those first ``D`` features says so by ``point_features = True``: what
+    iterates the point alone then computes no others. The statement is about the ``forward`` beside it: a
+    subclass with another ``forward`` makes it anew.
+
     A head has no parameters of its own: what it learns besides the features is its constants, of which
     the predictor keeps one row per skip.
 
@@ -30,6 +35,12 @@ class Head(nn.Module):
     """
 
     stackable = False
+    point_features = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "forward" in cls.__dict__ and "point_features" not in cls.__dict__:
+            cls.point_features = False
 
     def num_features(self, latent_dim: int) -> int:
         """Number of state-dependent features for a latent of ``latent_dim``.

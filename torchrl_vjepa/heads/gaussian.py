@@ -37,6 +37,7 @@ class DeltaHead(Head):
     """
 
     stackable = True
+    point_features = True
 
     def forward(self, features: Tensor, constants: Tensor) -> Delta:
         """Point mass on the features.
@@ -76,6 +77,7 @@ class DiagGaussianHead(Head):
     """
 
     stackable = True
+    point_features = True
 
     def __init__(
         self,
@@ -218,6 +220,8 @@ class FullGaussianHead(_CorrelatedHead):
                 [0.7053, 1.0000]])
     """
 
+    point_features = True
+
     def __init__(
         self,
         scale: Literal["state", "constant"] = "state",
@@ -275,6 +279,8 @@ class LowRankGaussianHead(_CorrelatedHead):
         >>> p.batch_shape, p.variance[0]
         (torch.Size([5]), tensor([1.0000, 1.0000, 1.0000]))
     """
+
+    point_features = True
 
     def __init__(
         self,

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
-import warnings
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
@@ -18,40 +16,25 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import MPCPlannerBase
 
 from torchrl_vjepa.actions import ActionCodec
-from torchrl_vjepa.generators import pack_generator, unpack_generator
+from torchrl_vjepa.generators import offspring, pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
+from torchrl_vjepa.planners.plan import Plan, check_counts, remembered, warn_of_costs
 from torchrl_vjepa.planners.proposal import Proposal, ProposalFamily
-from torchrl_vjepa.risk import REJECTED_COST, ChanceConstraint, Risk
+from torchrl_vjepa.risk import ChanceConstraint, Risk
 
-__all__ = ["Plan", "Planner"]
+__all__ = ["Planner"]
 
+_STATISTICS = ("actions", "std", "cost", "violation")
+_SAMPLING = ("num_samples", "risk", "constraints", "fusion")
 _GENERATORS = ("_generator", "_model_generator")
 
 
-class Plan(NamedTuple):
-    """What a planning call found.
+class _Found(NamedTuple):
+    """What is planned from, the plan, and how many of its steps were executed before."""
 
-    Attributes:
-        actions: the plan, in code, of shape ``(*B, H, A)``; its first step is executed.
-        std: spread of the last proposal, of shape ``(*B, H, A)``.
-        best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
-        best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite, at least
-            :data:`~torchrl_vjepa.risk.REJECTED_COST` where no plan satisfied the chance constraints.
-        statistics: what else a search has to tell, one entry with batch ``*B`` for each name in
-            ``own_statistics`` of its planner.
-
-    Examples:
-        >>> import torch
-        >>> plan = torch.zeros(5, 2)
-        >>> Plan(plan, torch.ones(5, 2), plan, torch.tensor(0.5)).best_cost
-        tensor(0.5000)
-    """
-
-    actions: Tensor
-    std: Tensor
-    best: Tensor
-    best_cost: Tensor
-    statistics: Mapping[str, Tensor] = MappingProxyType({})
+    state: Any
+    plan: Plan
+    age: Tensor | None
 
 
 class Planner(MPCPlannerBase):
@@ -98,6 +81,9 @@ class Planner(MPCPlannerBase):
             actions, the probability with which a choice is drawn anew.
         init_std: spread of the proposal after a cold start: a fraction of half the range where the
             action is bounded (0.5 by default), in units of the action where it is not (no default).
+        replan_interval: steps of a plan that are executed before the next search; needs ``warm_start``. How
+            many were is counted in the tensordict, under ``plan_key`` with ``_age`` appended, for each row:
+            the search is left out where no row needs it.
         num_samples: trajectories ``M`` imagined for each plan; the environment's way by default.
         risk: ``(costs (M, *B)) -> (*B)`` of their costs, for instance
             :func:`~torchrl_vjepa.risk.cvar`; the environment's by default.
@@ -106,10 +92,14 @@ class Planner(MPCPlannerBase):
         fusion: how the environment's prior enters the cost of a plan: as an ``"energy"``, or by posterior
             (``"weight"``, ``"propose"``; see :class:`~torchrl_vjepa.envs.LatentEnv`); the environment's by
             default.
+        compile: call the objective through ``torch.compile``, with these options (``{"mode":
+            "reduce-overhead"}`` are CUDA graphs on a GPU). The first call, and the first of each new batch
+            size, takes long.
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
             (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
             there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
-            ``(*B, C)``); cost and violation from fresh noise.
+            ``(*B, C)``); cost and violation from fresh noise. A mapping ``name -> risk`` also writes these
+            risks of the plan's cost, from the same noise, under ``("plan_stats", name)``.
         plan_key: the plan's entry.
         init_key: set where an episode begins (``InitTracker``).
         seed: of the generator; by default the global seed, ``torch.initial_seed()``.
@@ -161,17 +151,25 @@ class Planner(MPCPlannerBase):
         warm_start: bool = True,
         warm_std: float = 0.3,
         init_std: float | None = None,
+        replan_interval: int = 1,
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: Literal["energy", "weight", "propose"] | None = None,
-        return_stats: bool = False,
+        compile: bool | Mapping[str, Any] = False,
+        return_stats: bool | Mapping[str, Risk] = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
         seed: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         check_counts(planning_horizon=planning_horizon, optim_steps=optim_steps)
+        check_counts(replan_interval=replan_interval)
+        if replan_interval > (planning_horizon if warm_start else 1):
+            raise ValueError(
+                f"replan_interval must be at most planning_horizon={planning_horizon}, and 1 without "
+                f"warm_start, got {replan_interval}"
+            )
         if not 0 < warm_std <= 1:
             raise ValueError(f"warm_std must be in (0, 1], got {warm_std}")
         if init_std is not None and not 0 < init_std < math.inf:
@@ -195,25 +193,41 @@ class Planner(MPCPlannerBase):
         self.num_samples, self.risk, self.fusion = num_samples, risk, fusion
         self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
-        self.warm_start, self.warm_std, self.return_stats = warm_start, warm_std, return_stats
+        self.compile_options = None if compile is False else {} if compile is True else dict(compile)
+        self._compiled: Callable[..., Tensor] | None = None
+        self.warm_start, self.warm_std = warm_start, warm_std
+        self.return_stats, self.stats_risks = bool(return_stats), self._checked_risks(return_stats)
         self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
-        self.action_shape = tuple(codec.shape)
+        self.action_shape, self.replan_interval = tuple(codec.shape), replan_interval
+        *group, name = [self.plan_key] if isinstance(self.plan_key, str) else self.plan_key
+        self.age_key = unravel_key((*group, f"{name}_age"))
         own = self._env_objective
         reads = list(env.planning_keys if own is None else own.in_keys)
         writes = list(written)
         if warm_start:
             reads += [self.plan_key, self.init_key]
             writes.append(unravel_key(("next", self.plan_key)))
+        if replan_interval > 1 and return_stats and self.own_statistics:
+            raise ValueError(
+                f"replan_interval must be 1 for the statistics of {type(self).__name__}, which are of a "
+                f"search in every step, got {replan_interval}"
+            )
+        if replan_interval > 1:
+            reads.append(self.age_key)
+            writes.append(unravel_key(("next", self.age_key)))
         if return_stats:
-            names = ["actions", "std", "cost", *(["violation"] if self._constrained else [])]
-            names += self.own_statistics
+            names = [
+                *_STATISTICS[: None if self._constrained else -1],
+                *self.stats_risks,
+                *self.own_statistics,
+            ]
             writes += [("plan_stats", name) for name in names]
         self.in_keys, self.out_keys = reads, writes
         if generator is None:
             generator = torch.Generator(self.low.device)
             generator.manual_seed(torch.initial_seed() if seed is None else seed)
         self._generator = generator
-        self._model_generator = _offspring(generator, generator.device)
+        self._model_generator = offspring(generator, generator.device)
 
     @property
     def low(self) -> Tensor:
@@ -247,7 +261,7 @@ class Planner(MPCPlannerBase):
             seed: any integer that ``torch.Generator.manual_seed`` takes.
         """
         self._generator.manual_seed(seed)
-        self._model_generator = _offspring(self._generator, self._generator.device)
+        self._model_generator = offspring(self._generator, self._generator.device)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """The transform that carries the plan from step to step, zero at every reset.
@@ -260,6 +274,8 @@ class Planner(MPCPlannerBase):
         if self.warm_start:
             shape = (self.planning_horizon, *self.action_shape)
             primers[self.plan_key] = Unbounded(shape, device=self.low.device, dtype=self.low.dtype)
+        if self.replan_interval > 1:
+            primers[self.age_key] = Unbounded((1,), device=self.low.device, dtype=torch.int64)
         return TensorDictPrimer(Composite(primers), expand_specs=True)
 
     def planning(self, td: TensorDictBase) -> Tensor | TensorDictBase:
@@ -272,8 +288,8 @@ class Planner(MPCPlannerBase):
             Actions of shape ``(*B, *shape)``; a tensordict of them where there are several.
         """
         with torch.no_grad():
-            code = self._plan_from(td)[1].actions[..., 0, :]
-        return self._executed(code)[0] if len(self.codec.keys) == 1 else self.codec.decode(code)
+            code = self._plan_from(td).plan.actions[..., 0, :]
+        return self.codec.executed(code)[0] if len(self.codec.keys) == 1 else self.codec.decode(code)
 
     def forward(
         self,
@@ -299,16 +315,21 @@ class Planner(MPCPlannerBase):
         if kwargs:
             raise TypeError(f"{type(self).__name__} takes no keywords, got {sorted(kwargs)}")
         with torch.no_grad():
-            state, plan = self._plan_from(tensordict)
-            written = self._executed(plan.actions[..., 0, :])
+            state, plan, age = self._plan_from(tensordict)
+            written = self.codec.executed(plan.actions[..., 0, :])
             if self.warm_start:
                 shifted = torch.cat([plan.actions[..., 1:, :], plan.actions[..., -1:, :]], dim=-2)
                 written.append(self._shaped(shifted))
+            if age is not None:
+                written.append(((age + 1) % self.replan_interval).unsqueeze(-1))
             if self.return_stats:
                 written += [self._shaped(plan.actions), self._shaped(plan.std)]
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
                 written += [plan.statistics[name] for name in self.own_statistics]
-        return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
+        out = tensordict if tensordict_out is None else tensordict_out
+        for key, value in zip(self.out_keys, written, strict=True):
+            out.set(key, value)
+        return out
 
     @abc.abstractmethod
     def plan(self, state: Any, proposal: Proposal) -> Plan:
@@ -326,48 +347,60 @@ class Planner(MPCPlannerBase):
     def _source(self) -> Any:
         return self.env if self._env_objective is None else self._env_objective
 
-    def _plan_from(self, tensordict: TensorDictBase) -> tuple[Any, Plan]:
+    def _plan_from(self, tensordict: TensorDictBase) -> _Found:
         state = self._source.planning_state(tensordict)
         batch = state.shape[:-1] if isinstance(state, Tensor) else state.batch_size
         self._follow_device()
-        plan = self.plan(state, self._start(tensordict, batch))
-        if not bool(plan.best_cost.isfinite().all()):
-            warnings.warn(
-                "no candidate plan has a finite cost in at least one row: its action is the mean "
-                "of the proposal; check the model, the cost and the input for nan and inf",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-        elif self._constrained and bool((plan.best_cost >= REJECTED_COST).any()):
-            warnings.warn(
-                "no candidate plan satisfies the chance constraints in at least one row: its plan is the "
-                "one of least violation; widen the search, or loosen delta",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-        return state, plan
+        start = self._start(tensordict, batch)
+        if self.replan_interval == 1:
+            age, plan = None, self.plan(state, start)
+        else:
+            age, plan = self._continued(tensordict, batch, state, start)
+        warn_of_costs(plan.best_cost, self._constrained)
+        return _Found(state, plan, age)
+
+    def _continued(
+        self, tensordict: TensorDictBase, batch: torch.Size, state: Any, start: Proposal
+    ) -> tuple[Tensor, Plan]:
+        """Rows in the middle of a plan go on with it; steps of it that were executed, and the plan."""
+        stored, warm = self._remembered(tensordict, batch)
+        age = tensordict.get(self.age_key, None)
+        if stored is None or age is None:
+            return torch.zeros(batch, dtype=torch.int64, device=start.mean.device), self.plan(state, start)
+        age = torch.where(warm, age.reshape(batch), 0)
+        running = age > 0
+        stored = self.codec.mode(stored.clamp(self.low, self.high))
+        old = Plan(stored, start.std, stored, torch.zeros_like(stored[..., 0, 0]))
+        if bool(running.all()):
+            return age, old
+        new = self.plan(state, start)
+        rows = running[..., None, None]
+        parts = (
+            torch.where(rows if a.ndim > age.ndim else running, a, b)
+            for a, b in zip(old[:4], new[:4], strict=True)
+        )
+        return age, Plan(*parts)
 
     def _start(self, tensordict: TensorDictBase, batch: torch.Size) -> Proposal:
         """Proposal from the plan of the step before where there is one, else from the bounds."""
         cold = self.family.cold(batch, self.planning_horizon)
-        plan = tensordict.get(self.plan_key, None) if self.warm_start else None
+        plan, warm = self._remembered(tensordict, batch)
         if plan is None:
             return cold
-        expected = (*batch, self.planning_horizon, *self.action_shape)
-        if tuple(plan.shape) != expected:
-            raise ValueError(f"{self.plan_key!r} must have shape {expected}, got {tuple(plan.shape)}")
-        plan = plan.to(cold.mean.dtype).reshape(cold.mean.shape)
-        rows = plan.flatten(-2)
-        warm = rows.isfinite().all(dim=-1)
-        is_init = tensordict.get(self.init_key, None)
-        if is_init is not None:
-            warm = warm & ~is_init.reshape(batch).bool()
-        if is_init is None or self.codec.is_continuous:
-            warm = warm & (rows != 0).any(dim=-1)  # bits may all be zero, and a plan
+        start = self.family.around(plan, self.warm_std)
         warm = warm[..., None, None]
-        # Not a number would stay one through the mixing, and be chosen by no row that is warm.
-        start = self.family.around(torch.where(warm, plan, 0.0), self.warm_std)
         return Proposal(*(torch.where(warm, a, b) for a, b in zip(start, cold, strict=True)))
+
+    def _remembered(self, tensordict: TensorDictBase, batch: torch.Size) -> tuple[Tensor | None, Tensor]:
+        """The plan of the step before ``(*B, H, A)``, zero in rows without one, and which rows have one."""
+        shape = (*batch, self.planning_horizon, *self.action_shape)
+        plan = tensordict.get(self.plan_key, None) if self.warm_start else None
+        if plan is not None and tuple(plan.shape) != shape:
+            raise ValueError(f"{self.plan_key!r} must have shape {shape}, got {tuple(plan.shape)}")
+        if plan is None:
+            return None, torch.zeros(batch, dtype=torch.bool)
+        plan = plan.to(self.low.dtype).reshape((*batch, self.planning_horizon, self.codec.size))
+        return remembered(plan, tensordict.get(self.init_key, None), zero_is_cold=self.codec.is_continuous)
 
     def _checked_sampling(self, asked: dict[str, Any]) -> bool:
         """Refuse early what the environment cannot evaluate; true if there are constraints."""
@@ -391,28 +424,63 @@ class Planner(MPCPlannerBase):
             generator = self._model_generator
             frequency = self._source.violation_probability(state, plan, generator=generator, **asked)
             statistics.append(frequency.squeeze(-2))
+        for risk in self.stats_risks.values():
+            self._model_generator.set_state(noise)
+            alone = {"constraints": ()} if self._constrained else {}
+            statistics.append(self._evaluate(state, plan, risk=risk, **alone))
         return statistics
 
-    def _evaluate(self, state: Any, candidates: Tensor) -> Tensor:
-        names = "num_samples", "risk", "constraints", "fusion"
-        asked = _given({name: getattr(self, name) for name in names})
-        generator = self._model_generator
-        costs = self._source.objective(state, candidates, generator=generator, **asked)
-        costs = costs.to(candidates.dtype)
-        return torch.where(costs.isfinite(), costs, math.inf)
+    def _checked_risks(self, return_stats: bool | Mapping[str, Risk]) -> dict[str, Risk]:
+        """The risks that are reported, refused early where they cannot be."""
+        risks = dict(return_stats) if isinstance(return_stats, Mapping) else {}
+        for name, risk in risks.items():
+            if name in _STATISTICS:
+                raise ValueError(f"return_stats must not rename {name!r}, which is always written")
+            self._checked_sampling(_given({name: getattr(self, name) for name in _SAMPLING}) | {"risk": risk})
+        return risks
 
-    def _executed(self, code: Tensor) -> list[Tensor]:
-        """The tensors of the action, in their shapes and dtypes."""
-        if self.codec.is_identity:
-            return [self._shaped(code)]
-        return self.codec.decode_leaves(code)
+    def _evaluate(self, state: Any, candidates: Tensor, **instead: Any) -> Tensor:
+        return self._evaluator(state, **instead)(candidates)
+
+    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
+        """``candidates (*B, N, H, A) -> costs (*B, N)`` of one planning call, infinite where not finite."""
+        asked = _given({name: getattr(self, name) for name in _SAMPLING}) | instead
+        source, generator = self._source, self._model_generator
+        # A subclass that gives another objective alone must be asked for that.
+        owner = next(cls for cls in type(source).__mro__ if "objective" in vars(cls))
+        if self.compile_options is None and "objective_from" in vars(owner):
+            objective = source.objective_from(state, **asked)
+        else:
+
+            def objective(candidates: Tensor, generator: torch.Generator) -> Tensor:
+                return self._called(source.objective, state, candidates, generator=generator, **asked)
+
+        def evaluate(candidates: Tensor) -> Tensor:
+            costs = objective(candidates, generator)
+            return costs.to(candidates.dtype).nan_to_num(math.inf, math.inf, math.inf)
+
+        return evaluate
+
+    def _called(self, objective: Callable[..., Tensor], *args: Any, **kwargs: Any) -> Tensor:
+        """The objective's answer, compiled if that was asked for."""
+        if self.compile_options is None:
+            return objective(*args, **kwargs)
+        if self._compiled is None:
+            self._compiled = torch.compile(objective, **self.compile_options)
+        try:
+            return self._compiled(*args, **kwargs)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            raise RuntimeError(
+                f"compile must be False for the objective of {type(self.env).__name__} on this machine: "
+                f"torch.compile failed with {type(error).__name__}: {error}"
+            ) from error
 
     def _shaped(self, actions: Tensor) -> Tensor:
         return actions.reshape((*actions.shape[:-1], *self.action_shape))
 
     def __getstate__(self) -> dict[str, Any]:
         packed = {name: pack_generator(self.__dict__[name]) for name in _GENERATORS}
-        return {**super().__getstate__(), **packed}
+        return {**super().__getstate__(), **packed, "_compiled": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         unpacked = {name: unpack_generator(state[name]) for name in _GENERATORS}
@@ -421,31 +489,8 @@ class Planner(MPCPlannerBase):
     def _follow_device(self) -> None:
         """Generators live on one device: after ``.to(device)`` new ones continue from the old."""
         if self._generator.device != self.low.device:
-            self._generator = _offspring(self._generator, self.low.device)
-            self._model_generator = _offspring(self._generator, self.low.device)
-
-
-def check_counts(**counts: int) -> None:
-    """Refuse what does not count anything.
-
-    Args:
-        **counts: arguments by name.
-
-    Raises:
-        ValueError: if one is no integer of at least 1.
-
-    Examples:
-        >>> check_counts(optim_steps=4)
-    """
-    for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-
-
-def _offspring(generator: torch.Generator, device: torch.device) -> torch.Generator:
-    """A new generator, seeded by a draw from another."""
-    seed = torch.randint(2**62, (), generator=generator, device=generator.device)
-    return torch.Generator(device).manual_seed(int(seed))
+            self._generator = offspring(self._generator, self.low.device)
+            self._model_generator = offspring(self._generator, self.low.device)
 
 
 def _given(arguments: dict[str, Any]) -> dict[str, Any]:

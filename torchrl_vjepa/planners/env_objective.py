@@ -77,6 +77,7 @@ class EnvObjective:
         if not reads:
             reads = [*env.observation_spec.keys(True, True)]
         reads += getattr(getattr(env, "world_model", None), "in_keys", [])
+        reads += getattr(base, "task_keys", [])  # no specification knows them
         self.in_keys = list(dict.fromkeys(k for k in map(unravel_key, reads) if k not in own))
         done_keys = [k for k in map(unravel_key, env.done_keys) if _path(k)[-1] == "done"]
         depth = min((len(_path(k)) for k in done_keys), default=0)
@@ -181,7 +182,7 @@ class EnvObjective:
             What comes next: state, reward and done.
         """
         state = state.copy()
-        for key, leaf in zip(self.codec.keys, self.codec.decode_leaves(action), strict=True):
+        for key, leaf in zip(self.codec.keys, self.codec.executed(action), strict=True):
             state.set(key, leaf)
         return self.env.step(state).get("next")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import time
+import warnings
 from typing import Any, Literal
 
 import torch
@@ -12,7 +13,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.distributions.modes import MakeOptimizer
-from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.squash import squash, unsquash
 
@@ -73,8 +75,9 @@ class GradientMPC(Planner):
         **kwargs: see :class:`Planner`; ``("plan_stats", "std")`` is the spread of the starts.
 
     Raises:
-        ValueError: if an argument is out of its range, or there are chance constraints; else see
-            :class:`Planner`. When planning: if no gradient flows from the actions to the cost.
+        ValueError: if an argument is out of its range, there are chance constraints, or the environment's
+            prior has no gradient; else see :class:`Planner`. When planning: if no gradient flows from the
+            actions to the cost, or to the prior in it.
         TypeError: if actions are discrete, or ``optimizer`` does not make an optimiser; else see
             :class:`Planner`.
 
@@ -131,6 +134,12 @@ class GradientMPC(Planner):
                 "gradient; use a smooth barrier as a cost, a sampling planner (CEM, MPPI), or lift those of "
                 "env by constraints=[]"
             )
+        prior = getattr(getattr(env, "world_model", None), "prior", None)
+        if not getattr(prior, "differentiable", True):
+            raise ValueError(
+                f"env must not have a prior with differentiable=False, got {type(prior).__name__}; use a "
+                "sampling planner (CEM, MPPI) for it"
+            )
         self.optimizer = functools.partial(torch.optim.Adam, lr=0.2) if optimizer is None else optimizer
         # Made once here, so that what is no factory is refused before planning.
         made = self.optimizer([torch.zeros(1, requires_grad=True)]) if callable(self.optimizer) else None
@@ -161,6 +170,13 @@ class GradientMPC(Planner):
         with torch.inference_mode(False), torch.enable_grad():
             proposal = Proposal(*(part.detach().clone() for part in proposal))
             found = self._descend(state.detach().clone(), proposal)
+        if not bool((found.guided | ~found.cost.isfinite()).all()):
+            warnings.warn(
+                "the cost has no finite gradient at any plan in at least one row: its action is that of the "
+                "best start; check the energy and the cost for square roots and logarithms of zero",
+                RuntimeWarning,
+                stacklevel=3,
+            )
         return Plan(found.actions, proposal.std, found.actions, found.cost)
 
     def _descend(self, state: Any, proposal: Proposal) -> _Incumbent:
@@ -198,6 +214,7 @@ class GradientMPC(Planner):
                     "the cost must be differentiable in the actions, got one to which no gradient flows "
                     f"through {type(self.env).__name__}; use a sampling planner (CEM, MPPI) for it"
                 )
+            found.guided = found.guided | gradient.isfinite().flatten(-3).any(dim=-1)
             # LBFGS wants its gradients contiguous.
             x.grad = gradient.nan_to_num(0.0, 0.0, 0.0).contiguous()
             return objective.detach()
@@ -237,6 +254,7 @@ class _Incumbent:
 
     def __init__(self, actions: Tensor) -> None:
         self.evaluated = False
+        self.guided = torch.zeros(actions.shape[:-2], dtype=torch.bool, device=actions.device)
         self.actions = actions
         self.cost = actions.new_full(actions.shape[:-2], math.inf)
         self.mark = self.cost  # at the last improvement that counted

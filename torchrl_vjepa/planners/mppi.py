@@ -92,7 +92,7 @@ class MPPI(SamplingPlanner):
         Returns:
             The next proposal.
         """
-        finite = costs.isfinite()
+        finite = costs < math.inf
         # The lowest cost is subtracted first, so the largest exponent is 0 at any magnitude.
         limits = torch.finfo(costs.dtype)
         excess = torch.where(finite, (costs - costs[..., :1]).clamp_max(limits.max), 0.0)

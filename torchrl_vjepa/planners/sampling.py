@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import abc
 import math
+import time
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.base import Plan, Planner, check_counts
+from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.noise import coloured_noise_factor
+from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.risk import REJECTED_COST
 
@@ -46,8 +50,18 @@ class SamplingPlanner(Planner):
         min_std: floor under the spread, as a fraction of the one after a cold start; for discrete actions,
             the weight of the uniform distribution in the proposal.
         antithetic: draw noise in pairs of opposite sign.
+        chunk_size: candidates (of every row) that are imagined at a time; all by default. The memory of a
+            round is then that of ``chunk_size`` candidates; the plan is the same up to rounding, except in
+            environments that draw their own noise.
+        max_ms: time for a plan, in milliseconds: no round begins that would end later, if it took as long as
+            the longest before it. The first always runs; the plan is that of the rounds that did. Waits for
+            the device after each round, and how far planning gets depends on the machine and the batch size.
         output: the plan is the ``"mean"`` of the proposal (where actions are discrete its most probable
             plan), or the ``"best"`` candidate seen.
+        noise_beta: colour of the noise along a plan, from 0 (white: every step is drawn alone) to 4: with a
+            power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
+            (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
+        keep_elites: fraction of the elites that are candidates again in the next round.
         **kwargs: see :class:`Planner`.
 
     Raises:
@@ -79,6 +93,8 @@ class SamplingPlanner(Planner):
         (tensor([0.5000]), torch.Size([1, 1]))
     """
 
+    _colour: Tensor | None
+
     def __init__(
         self,
         env: EnvBase,
@@ -89,7 +105,11 @@ class SamplingPlanner(Planner):
         *,
         min_std: float = 0.01,
         antithetic: bool = True,
+        chunk_size: int | None = None,
+        max_ms: float | None = None,
         output: Literal["mean", "best"] = "mean",
+        noise_beta: float = 0.0,
+        keep_elites: float = 0.0,
         **kwargs: Any,
     ) -> None:
         check_counts(num_candidates=num_candidates)
@@ -101,9 +121,23 @@ class SamplingPlanner(Planner):
             raise ValueError(f"min_std must be in (0, 1], got {min_std}")
         if output not in ("mean", "best"):
             raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
+        if chunk_size is not None:
+            check_counts(chunk_size=chunk_size)
+        if max_ms is not None and not 0 < max_ms < math.inf:
+            raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
+        if not 0 <= noise_beta <= 4:
+            raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
+        if not 0 <= keep_elites <= 1:
+            raise ValueError(f"keep_elites must be in [0, 1], got {keep_elites}")
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
+        self.noise_beta, self.keep_elites = noise_beta, keep_elites
+        # The best plan is a candidate again anyway, so it is the next ones that are kept.
+        self._num_kept = min(int(keep_elites * top_k), top_k - 1, max(0, num_candidates - 2))
+        colour = coloured_noise_factor(planning_horizon, noise_beta) if noise_beta else None
+        self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
     @abc.abstractmethod
     def update(self, proposal: Proposal, elites: Tensor, costs: Tensor) -> Proposal:
@@ -133,36 +167,60 @@ class SamplingPlanner(Planner):
         codec, family = self.codec, self.family
         best = codec.mode(proposal.mean)
         best_cost = best.new_full(best.shape[:-2], math.inf)
-        model_state = self._model_generator.get_state()
+        generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
+        model_state = generator.get_state()
+        evaluate = self._evaluator(state)
+        clock = None if self.max_ms is None else _Clock(self.max_ms)
+        kept = None
         for _ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
-            self._model_generator.set_state(model_state)
-            candidates = self._candidates(proposal, best)
-            costs = self._evaluate(state, candidates)
-            elite_costs, index = costs.topk(self.top_k, dim=-1, largest=False)
-            if self._constrained:
+            generator.set_state(model_state)
+            candidates = self._candidates(proposal, best, kept)
+            costs = evaluate(candidates)
+            elite_costs, index = costs.topk(top_k, dim=-1, largest=False)
+            if constrained:
                 feasible = elite_costs < REJECTED_COST
                 elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
-            index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
+            index = index.unsqueeze(-1).unsqueeze(-1).expand(*index.shape, *candidates.shape[-2:])
             elites = candidates.gather(-3, index)
-            found = elite_costs[..., 0].isfinite()[..., None, None]
-            better = elite_costs[..., 0] < best_cost
-            best = torch.where(better[..., None, None], elites[..., 0, :, :], best)
-            best_cost = torch.where(better, elite_costs[..., 0], best_cost)
+            kept = elites[..., 1 : 1 + self._num_kept, :, :]
+            lowest = elite_costs.select(-1, 0)  # infinite where no cost is finite
+            better = (lowest < best_cost).unsqueeze(-1).unsqueeze(-1)
+            best = torch.where(better, elites.select(-3, 0), best)
+            best_cost = torch.minimum(lowest, best_cost)
             mean, std = self.update(proposal, elites, elite_costs)
+            found = (lowest < math.inf).unsqueeze(-1).unsqueeze(-1)
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
             proposal = family.confine(Proposal(mean, std), self.min_std)
+            if clock is not None and not clock.another(best_cost):
+                break
         actions = codec.mode(proposal.mean) if self.output == "mean" else best
         if self._constrained and self.output == "mean":
             # The mean of feasible plans may be none (around an obstacle it lies in it).
             self._model_generator.set_state(model_state)
-            cost = self._evaluate(state, actions.unsqueeze(-3))[..., 0]
+            cost = evaluate(actions.unsqueeze(-3))[..., 0]
             worse = (cost >= REJECTED_COST) & (best_cost < cost)
             actions = torch.where(worse[..., None, None], best, actions)
         return Plan(actions, proposal.std, best, best_cost)
 
-    def _candidates(self, proposal: Proposal, best: Tensor) -> Tensor:
+    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
+        evaluate = super()._evaluator(state, **instead)
+        size, generator = self.chunk_size, self._model_generator
+        if size is None:
+            return evaluate
+
+        def in_chunks(candidates: Tensor) -> Tensor:
+            noise = generator.get_state()
+            costs = []
+            for chunk in candidates.split(size, dim=-3):
+                generator.set_state(noise)  # common to all candidates
+                costs.append(evaluate(chunk))
+            return torch.cat(costs, dim=-1)
+
+        return in_chunks
+
+    def _candidates(self, proposal: Proposal, best: Tensor, kept: Tensor | None = None) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
         mean = proposal.mean
         num = self.num_candidates
@@ -173,6 +231,8 @@ class SamplingPlanner(Planner):
             device=mean.device,
             dtype=mean.dtype,
         )
+        if self._colour is not None:
+            noise = self._colour @ noise
         if self.antithetic:
             noise = torch.cat([noise, -noise])[:num]
         candidates = self.family.draw(proposal, noise)
@@ -180,4 +240,22 @@ class SamplingPlanner(Planner):
             candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
+        if kept is not None and self._num_kept:
+            candidates[..., num - self._num_kept :, :, :] = kept
         return candidates
+
+
+class _Clock:
+    """Whether there is time for another round."""
+
+    def __init__(self, max_ms: float) -> None:
+        self.last = time.perf_counter()
+        self.end = self.last + 1e-3 * max_ms
+        self.longest = 0.0
+
+    def another(self, result: Tensor) -> bool:
+        """Count one round, which ends when its result is there."""
+        result.sum().item()
+        now = time.perf_counter()
+        self.longest, self.last = max(self.longest, now - self.last), now
+        return now + self.longest <= self.end

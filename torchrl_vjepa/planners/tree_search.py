@@ -14,9 +14,9 @@ from torchrl.envs import EnvBase
 from torchrl.modules.mcts import MCTSScore, PUCTScore
 
 from torchrl_vjepa.envs import LatentEnv
-from torchrl_vjepa.planners.base import Plan, check_counts
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State
+from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.search_tree import SearchTree
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -14,6 +15,7 @@ from torchrl.modules import MLP
 
 from torchrl_vjepa.heads import DiagGaussianHead, Head
 from torchrl_vjepa.predictor.model import PredictiveModel
+from torchrl_vjepa.predictor.trunks import linear_and_others
 from torchrl_vjepa.stacking import is_plain_linear, linear
 from torchrl_vjepa.temperature import temper
 
@@ -213,14 +215,10 @@ class Predictor(PredictiveModel):
             ValueError: if a shape does not fit or ``skip`` was not learned.
             TypeError: if the inputs have another dtype than the weights, outside of autocast.
         """
-        if skip not in self.skips:
-            raise ValueError(f"skip must be one of skips={self.skips}, got {skip}")
-        if not latent.ndim or latent.shape[-1] != self.latent_dim:
-            raise ValueError(f"latent must have shape (*B, {self.latent_dim}), got {tuple(latent.shape)}")
+        index = self._index(latent, skip)
         inputs = [latent]
         if self.action_dim or action is not None:
             inputs.append(self._chunk(latent, action, skip))
-        index = self.skips.index(skip)
         if self.trunk == "mlp":
             if self.action_dim:
                 inputs[-1] = F.pad(inputs[-1], (0, (max(self.skips) - skip) * self.action_dim))
@@ -230,12 +228,7 @@ class Predictor(PredictiveModel):
             inputs.append(self._side_info(latent, side_info))
         trunk = self.trunks[index if self.trunk == "linear" else 0]
         joined = torch.cat(inputs, dim=-1) if len(inputs) > 1 else latent
-        dtype = self.constants.dtype
-        if joined.dtype != dtype and not torch.is_autocast_enabled(joined.device.type):
-            raise TypeError(
-                f"latent, action and side_info must have the dtype of the predictor's weights, {dtype}, "
-                f"got {[item.dtype for item in (latent, action, side_info) if item is not None]}; cast them"
-            )
+        self._check_dtype(latent, action, side_info)
         plain = is_plain_linear(trunk)
         features = linear(joined, trunk.weight, trunk.bias) if plain else trunk(joined)
         if self.residual:
@@ -252,6 +245,104 @@ class Predictor(PredictiveModel):
         """Whether :meth:`dist` takes the stacked weights of several models (``linear``)."""
         plain = all(map(is_plain_linear, self.trunks))
         return plain and self.head.stackable and self.temperature is None
+
+    def point_step(
+        self, latent: Tensor, action: Tensor, dtype: torch.dtype | None = None
+    ) -> Callable[[Tensor, Tensor], Tensor] | None:
+        r"""The mean of :meth:`dist` one step ahead, prepared for many calls with inputs of one shape.
+
+        What does not change from call to call is done once: inputs are checked, weights are read, the
+        one-hot skip becomes a bias; and of the head's features only the mean is computed. Where gradients
+        are off, activations work in place. :func:`~torchrl_vjepa.belief.rollout` iterates it.
+
+        Args:
+            latent: an example of what it will be called with, of shape ``(R, D)``.
+            action: likewise, of shape ``(R, A)``.
+            dtype: what the network computes in, for instance ``torch.bfloat16``; latents come and go in
+                theirs. ``None``: the dtype of the weights.
+
+        Returns:
+            ``(latent, action) -> next latent``, which is mean and mode; ``None`` where there is no such
+            short way: a head that computes its mean from all features
+            (:class:`~torchrl_vjepa.heads.base.Head`), hooks, a trunk or a ``dist`` of a subclass.
+
+        Raises:
+            ValueError: if a shape does not fit, or ``skips`` has no 1.
+            TypeError: if the inputs have another dtype than the weights, outside of autocast.
+
+        Examples:
+            >>> import torch
+            >>> predictor = Predictor(4, action_dim=2, trunk="mlp")
+            >>> latent, action = torch.ones(7, 4), torch.ones(7, 2)
+            >>> step = predictor.point_step(latent, action)
+            >>> torch.allclose(step(latent, action), predictor.dist(latent, action).mean, atol=1e-6)
+            True
+        """
+        index = self._index(latent, 1)
+        if self.action_dim or action is not None:
+            self._chunk(latent, action, 1)
+        if self.side_info_dim:
+            self._side_info(latent, None)
+        self._check_dtype(latent, action, None)
+        head = self.head
+        hooked = head._forward_hooks or head._forward_pre_hooks
+        if type(self).dist is not Predictor.dist or not head.point_features or hooked:
+            return None
+        trunk = self.trunks[index if self.trunk == "linear" else 0]
+        layers = linear_and_others(trunk)
+        if layers is None or layers[0].weight.ndim != 2:
+            return None
+        size, action_dim, residual = self.latent_dim, self.action_dim, self.residual
+        last = len(layers) - 1
+        steps: list[Callable[[Tensor], Tensor]] = []
+        for place, layer in enumerate(layers):
+            if not isinstance(layer, nn.Linear):
+                hooked = layer._forward_hooks or layer._forward_pre_hooks
+                steps.append(layer if hooked else layer.forward)
+                continue
+            weight, bias = layer.weight, layer.bias
+            if place == 0 and self.trunk == "mlp":
+                constant = weight.select(1, size + max(self.skips) * action_dim + index)
+                bias = constant if bias is None else bias + constant
+                weight = weight.narrow(1, 0, size + action_dim)
+            if place == last and head.num_features(size) > size:
+                weight = weight.narrow(0, 0, size)
+                bias = None if bias is None else bias.narrow(0, 0, size)
+            bias = weight.new_zeros(()) if bias is None else bias
+            if dtype is not None:
+                weight, bias = weight.to(dtype), bias.to(dtype)
+            steps.append(functools.partial(torch.addmm, bias, mat2=weight.t()))
+
+        def step(latent: Tensor, action: Tensor) -> Tensor:
+            x = torch.cat([latent, action], dim=-1) if action_dim else latent
+            if dtype is not None:
+                x = x.to(dtype)
+            for layer in steps:
+                x = layer(x)
+            if dtype is not None:
+                x = x.to(latent.dtype)
+            return latent + x if residual else x
+
+        return step
+
+    def _index(self, latent: Tensor, skip: int) -> int:
+        """Place of a skip, where it was learned and the latent fits."""
+        if skip not in self.skips:
+            raise ValueError(f"skip must be one of skips={self.skips}, got {skip}")
+        if not latent.ndim or latent.shape[-1] != self.latent_dim:
+            raise ValueError(f"latent must have shape (*B, {self.latent_dim}), got {tuple(latent.shape)}")
+        return self.skips.index(skip)
+
+    def _check_dtype(self, *inputs: Tensor | None) -> None:
+        constants = self.constants
+        dtype = constants.dtype
+        given = [item.dtype for item in inputs if item is not None]
+        fits = all(item == dtype for item in given) or functools.reduce(torch.promote_types, given) == dtype
+        if not fits and not torch.is_autocast_enabled(constants.device.type):
+            raise TypeError(
+                f"latent, action and side_info must have the dtype of the predictor's weights, {dtype}, "
+                f"got {given}; cast them"
+            )
 
     def _chunk(self, latent: Tensor, action: Tensor | None, skip: int) -> Tensor:
         batch = latent.shape[:-1]
