@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import TensorDict
@@ -22,7 +22,7 @@ from torchrl_vjepa.planners.search_tree import SearchTree
 
 __all__ = ["TreeSearch"]
 
-Head = Callable[[Tensor], Tensor] | TensorDictModuleBase
+Head: TypeAlias = "Callable[[Tensor], Tensor] | TensorDictModuleBase"
 
 
 class TreeSearch(DiscretePlanner):
@@ -50,7 +50,9 @@ class TreeSearch(DiscretePlanner):
 
     **The plan** is the principal variation: the most visited actions, from the root on; of equal visits, the
     action of the best value; its last action repeated to the horizon. ``output="best"`` gives the cheapest
-    simulation instead: for a model that is trusted, where it never gets worse with more simulations.
+    simulation instead, for a model that is trusted: it never gets worse with more simulations, keeps a
+    perfect warm start, and is the better plan where simulations are few. Visits average over what a branch
+    may cost, and settle slowly between branches that are nearly equal.
 
     **Warm start**: the plan of the step before is the first simulation, and stays in the tree, state by
     state. The tree itself is not carried over: memory between steps is in the tensordict, and a tree's states
@@ -61,7 +63,8 @@ class TreeSearch(DiscretePlanner):
             that is not batch-locked and deterministic.
         planning_horizon: depth ``H`` of the tree.
         num_simulations: simulations ``S``, each of which adds a node.
-        exploration: :math:`c_{\text{puct}}`.
+        exploration: :math:`c_{\text{puct}}`. Values span the whole of :math:`[0, 1]` in every node, so it is
+            larger than where they are normalised over the tree.
         score: a module of :mod:`torchrl.modules.mcts` in place of ``PUCTScore(c=exploration)`` that reads
             ``win_count``, ``visits``, ``total_visits`` or ``prior_prob``, for instance ``UCBScore(c=1.4)``.
         discount: :math:`\gamma`, of costs and value; ``("plan_stats", "cost")`` is without.
@@ -73,7 +76,7 @@ class TreeSearch(DiscretePlanner):
             is weighted by the predicted probability of being alive.
         output: the plan is the principal variation of ``"visits"``, or the ``"best"`` simulation.
         return_stats: also writes ``("plan_stats", "visits")``, of the actions at the root, ``(*B, n)``, and
-            ``("plan_stats", "value")``, minus the mean cost of the simulations, ``(*B)``.
+            ``("plan_stats", "value")``, minus the mean cost of the simulations, ``(*B, 1)``.
             ``("plan_stats", "std")`` is the spread of the visits along the plan.
         **kwargs: see :class:`Planner`.
 
@@ -111,7 +114,7 @@ class TreeSearch(DiscretePlanner):
         planning_horizon: int,
         num_simulations: int = 100,
         *,
-        exploration: float = 2.5,
+        exploration: float = 4.0,
         score: MCTSScore | None = None,
         discount: float = 1.0,
         prior_policy: Head | None = None,
@@ -171,7 +174,7 @@ class TreeSearch(DiscretePlanner):
         noise = proposal.mean.new_empty(shape).exponential_(generator=self._generator).log().neg()
         if not batch.numel():
             empty = proposal.mean.new_zeros(*batch, self.num_actions)
-            statistics = {"visits": empty, "value": empty[..., 0]}
+            statistics = {"visits": empty, "value": empty[..., :1]}
             return Plan(*proposal, proposal.mean, empty[..., 0], statistics)
         index, warm = self._numbered(proposal)
         any_warm = bool(warm.any())
@@ -186,15 +189,23 @@ class TreeSearch(DiscretePlanner):
         if self.output == "best":
             found = search.best_cost.isfinite().unsqueeze(-1)
             actions = torch.where(found, search.best, actions)
+        shares = shares.to(self.choices.dtype)
         mean = shares @ self.choices
         std = (shares @ self.choices.square() - mean.square()).clamp_min(0).sqrt()
         visits, finite = tree.visits[:, 0], tree.finite[:, 0]
         value = -(finite * tree.mean[:, 0]).sum(dim=-1) / finite.sum(dim=-1)
         plan, best = self._coded(actions), self._coded(search.best)
-        statistics = {"visits": visits, "value": value}
+        statistics = {"visits": visits, "value": value.unsqueeze(-1)}
+
+        def shaped(part: Tensor) -> Tensor:
+            return part.reshape((*batch, *part.shape[1:]))
+
         return Plan(
-            *(part.reshape((*batch, *part.shape[1:])) for part in (plan, std, best, search.best_cost)),
-            {name: part.reshape((*batch, *part.shape[1:])) for name, part in statistics.items()},
+            shaped(plan),
+            shaped(std),
+            shaped(best),
+            shaped(search.best_cost),
+            {name: shaped(part) for name, part in statistics.items()},
         )
 
 
