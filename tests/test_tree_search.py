@@ -472,8 +472,8 @@ class TestModels:
     def test_tasks_by_row_and_by_step(self, batch: tuple[int, ...], steps: int | None) -> None:
         env = make_env(prior=GoalPrior(std=1.0))
         shape = batch if steps is None else (*batch, steps)
-        goal = torch.randn(*shape, 3, generator=torch.Generator().manual_seed(1), **F64)
-        self.check(env, TensorDict(latent=latents(*batch), goal=goal, batch_size=batch))
+        task = torch.randn(*shape, 3, generator=torch.Generator().manual_seed(1), **F64)
+        self.check(env, TensorDict(latent=latents(*batch), task=task, batch_size=batch))
 
     @pytest.mark.parametrize("spec", [Categorical(3), MultiCategorical([2, 2]), Binary(2)])
     def test_kinds_of_actions(self, spec: TensorSpec) -> None:
