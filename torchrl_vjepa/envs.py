@@ -79,7 +79,7 @@ class LatentEnv(ModelBasedEnvBase):
         prior: of the task; its energy is subtracted from the reward. Of ``reward_model``, ``cost`` and
             ``prior`` at least one must be given; what is given is added up.
         fusion: how the prior enters the cost of a plan; all but ``"energy"`` need sampled trajectories.
-        num_particles: of ``fusion="propose"``, for every step that has no closed form: memory grows with them.
+        num_particles: of ``fusion="propose"``, in every step that has no closed form; memory grows with them.
         termination_model: TensorDictModule that reads ``latent_key`` (the next latent) and ``action_key`` and
             writes ``"termination_logit"`` of shape ``(*B, 1)``, the logit of the episode's end
             (:class:`~torchrl_vjepa.objectives.TerminationLoss` trains it). Costs of a plan count as far as it

@@ -375,11 +375,12 @@ class Planner(MPCPlannerBase):
             return age, old
         new = self.plan(state, start)
         rows = running[..., None, None]
-        parts = (
-            torch.where(rows if a.ndim > age.ndim else running, a, b)
-            for a, b in zip(old[:4], new[:4], strict=True)
+        return age, Plan(
+            torch.where(rows, old.actions, new.actions),
+            torch.where(rows, old.std, new.std),
+            torch.where(rows, old.best, new.best),
+            torch.where(running, old.best_cost, new.best_cost),
         )
-        return age, Plan(*parts)
 
     def _start(self, tensordict: TensorDictBase, batch: torch.Size) -> Proposal:
         """Proposal from the plan of the step before where there is one, else from the bounds."""

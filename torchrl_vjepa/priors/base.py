@@ -312,7 +312,7 @@ def check_density(density: LatentDensity) -> None:
         except NotImplementedError:  # not every distribution knows them
             return
         # An infinite variance is no defect: heavy tails have it.
-        sound = mean.isfinite().all() and (std > 0).all()
+        sound = mean.isfinite().all() and (std > 0).all() and std.pow(-2).isfinite().all()
     if not sound:
         raise ValueError(
             "the prior's moments must be finite and its spread positive, but in this dtype they overflow: "
