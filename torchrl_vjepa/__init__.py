@@ -95,12 +95,14 @@ from torchrl_vjepa.planners import (
     CEM,
     MPPI,
     EnvObjective,
+    ExhaustiveSearch,
     GradientMPC,
     Planner,
     Proposal,
     ProposalFamily,
     RandomShooting,
     SamplingPlanner,
+    TreeSearch,
 )
 from torchrl_vjepa.predictor import FusedPredictor, Predictor
 from torchrl_vjepa.priors import (
@@ -160,6 +162,7 @@ __all__ = [
     "Ensemble",
     "EnsembleHead",
     "EnvObjective",
+    "ExhaustiveSearch",
     "FlowHead",
     "ForkEnv",
     "ForkSystem",
@@ -216,6 +219,7 @@ __all__ = [
     "TargetScale",
     "TerminationLoss",
     "TimeIndexedPrior",
+    "TreeSearch",
     "VAE",
     "VAELoss",
     "VJEPA",

@@ -6,7 +6,8 @@ import abc
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -38,6 +39,8 @@ class Plan(NamedTuple):
         best: the candidate of lowest cost that was seen, of shape ``(*B, H, A)``.
         best_cost: its cost, of shape ``(*B)``; infinite where no cost was finite, at least
             :data:`~torchrl_vjepa.risk.REJECTED_COST` where no plan satisfied the chance constraints.
+        statistics: what else a search has to tell, one entry with batch ``*B`` for each name in
+            ``own_statistics`` of its planner.
 
     Examples:
         >>> import torch
@@ -50,6 +53,7 @@ class Plan(NamedTuple):
     std: Tensor
     best: Tensor
     best_cost: Tensor
+    statistics: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class Planner(MPCPlannerBase):
@@ -147,6 +151,9 @@ class Planner(MPCPlannerBase):
         tensor([0.5000])
     """
 
+    #: Names of :attr:`Plan.statistics`, which ``return_stats`` writes too.
+    own_statistics: ClassVar[tuple[str, ...]] = ()
+
     def __init__(
         self,
         env: EnvBase,
@@ -203,6 +210,7 @@ class Planner(MPCPlannerBase):
             writes.append(unravel_key(("next", self.plan_key)))
         if return_stats:
             names = [*_STATISTICS[: None if self._constrained else -1], *self.stats_risks]
+            names += self.own_statistics
             writes += [("plan_stats", name) for name in names]
         self.in_keys, self.out_keys = reads, writes
         if generator is None:
@@ -303,6 +311,7 @@ class Planner(MPCPlannerBase):
             if self.return_stats:
                 written += [self._shaped(plan.actions), self._shaped(plan.std)]
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
+                written += [plan.statistics[name] for name in self.own_statistics]
         return self._write_to_tensordict(tensordict, tuple(written), tensordict_out)
 
     @abc.abstractmethod

@@ -170,6 +170,21 @@ class EnvObjective:
         state = state.expand(num_samples, *state.batch_size)
         return plan_cost(self._stepped(state, actions.expand(num_samples, *actions.shape)), risk)
 
+    def stepped(self, state: TensorDictBase, action: Tensor) -> TensorDictBase:
+        """One step of the environment.
+
+        Args:
+            state: what it reads, with batch size ``*B``; stays as it is.
+            action: in code, of shape ``(*B, A)``.
+
+        Returns:
+            What comes next: state, reward and done.
+        """
+        state = state.copy()
+        for key, leaf in zip(self.codec.keys, self.codec.executed(action), strict=True):
+            state.set(key, leaf)
+        return self.env.step(state).get("next")
+
     def _stepped(self, state: TensorDictBase, actions: Tensor) -> Tensor:
         """Minus the summed reward of one plan per row: ``(*B)`` of ``(*B, H, A)``."""
         batch = actions.shape[:-2]
@@ -177,10 +192,7 @@ class EnvObjective:
         cost = actions.new_zeros(batch)
         alive = torch.ones(batch, dtype=torch.bool, device=actions.device)
         for action in actions.unbind(-2):
-            current = current.copy()
-            for key, leaf in zip(self.codec.keys, self.codec.executed(action), strict=True):
-                current.set(key, leaf)
-            following = self.env.step(current).get("next")
+            following = self.stepped(current, action)
             reward = following.get(self.reward_key).reshape(*batch, -1).sum(dim=-1)
             cost = cost - torch.where(alive, reward, 0.0)
             for key in self.done_keys:
