@@ -52,6 +52,7 @@ from matplotlib import pyplot as plt
 
 EPISODE = 500  # steps, as Gymnasium has it
 GOAL = 0.95  # share of episodes that must stand to the end
+WARM_UP = 50  # optimiser steps of a round in which the learning rate rises
 ACTIONS = OneHot(2, dtype=torch.int64)  # as GymEnv has it
 EVAL_SEED = 1_000_000  # of the evaluation episodes: no training seed comes here
 LABELS = {
@@ -79,14 +80,14 @@ class Settings:
     train_steps: int = option(600, "optimiser steps in a round")
     windows: int = option(64, "windows in a batch")
     window: int = option(6, "steps in a window")
-    lr: float = option(0.01, "learning rate at the start of a round; it falls to zero along a cosine")
+    lr: float = option(5e-3, "learning rate at the start of a round; it falls to zero along a cosine")
     ema_decay: float = option(0.9, "tau of the target encoder")
     end_cost: float = option(1000.0, "cost of a predicted end, in nats of the prior")
     prior_std: float = option(10.0, "spread of the prior, in standard deviations of the latents at a start")
-    planning_horizon: int = option(30, "steps of 0.02 s that CEM imagines")
+    planning_horizon: int = option(50, "steps of 0.02 s that CEM imagines")
     optim_steps: int = option(2, "CEM rounds for each action")
-    num_candidates: int = option(32, "plans in a CEM round")
-    search_horizon: int = option(25, "steps that tree search looks ahead")
+    num_candidates: int = option(64, "plans in a CEM round")
+    search_horizon: int = option(50, "steps that tree search looks ahead")
     num_simulations: int = option(16, "simulations of tree search for each action")
     episodes: int = option(100, "evaluation episodes, the same for every planner and seed")
 
@@ -209,7 +210,7 @@ class Run:
         for step in tqdm(range(steps), desc=f"seed {self.seed}, round {self.rounds}", leave=False):
             lr = self.settings.lr * 0.5 * (1.0 + math.cos(math.pi * step / steps))
             for group in self.optimizer.param_groups:
-                group["lr"] = lr
+                group["lr"] = lr * min(1.0, (step + 1) / WARM_UP)
             windows = self.buffer.sample().reshape(-1, self.settings.window)
             losses = [*self.loss(windows).items(), *self.termination_loss(windows).items()]
             sum(value for key, value in losses if key.startswith("loss_")).backward()
