@@ -339,7 +339,7 @@ def figure(
         share = (values >= length.unsqueeze(1)).float().mean(1)
         stood.plot(length, share, color=COLORS[name], ls=style, lw=2, label=LABELS[name])
     stood.axhline(GOAL, color="0.6", lw=0.8)
-    stood.annotate(f"{GOAL:.0%}", (0, GOAL), (2, -10), textcoords="offset points", color="0.4")
+    stood.annotate(f"{GOAL:.0%}", (EPISODE, GOAL), (0, -10), textcoords="offset points", color="0.4")
     stood.set(
         xlabel="environment steps of an episode",
         ylabel="share of evaluation episodes that stand",
