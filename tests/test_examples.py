@@ -326,8 +326,30 @@ def check_goal_swap_report(report: dict[str, Any]) -> None:
 
 
 FAMILIES = ("goal", "keep-out", "two-regions")
+
+
+def check_cartpole_report(report: dict[str, Any]) -> None:
+    """Checks the report of ``cartpole.py``: one row for each planner and seed."""
+    assert set(report) == {"settings", "wall_s", "rows", "curves"}
+    settings, rows = report["settings"], report["rows"]
+    planners = ("categorical-cem", "tree-search", "random")
+    assert [(row["seed"], row["planner"]) for row in rows] == [
+        (seed, planner) for seed in settings["seeds"] for planner in planners
+    ]
+    steps = settings["random_steps"] + settings["rounds"] * settings["collect_steps"]
+    for row in rows:
+        assert {"planner", "seed", "env_steps", "return_mean", "return_min"} <= set(row)
+        assert row["env_steps"] == steps <= 20_000
+        assert 1 <= row["return_min"] <= row["return_mean"] <= 500
+        assert 0 <= row["balanced"] <= 1
+    for curve in report["curves"].values():
+        assert len(curve) == settings["rounds"] + 1
+        assert curve[-1][0] == steps
+
+
 CHECKS = {
     "goal_swap": check_goal_swap_report,
+    "cartpole": check_cartpole_report,
     "fork": check_fork_report,
     "noisy_tv_mppi": check_report,
     "noisy_tv_table": check_table_report,

@@ -49,15 +49,22 @@ class Case(NamedTuple):
     task_shape: tuple[int, ...] | None  # None: takes no task; () with dim: the time
 
 
+def at_goal() -> GoalPrior:
+    return GoalPrior(std=0.5, task_key="goal")
+
+
 def cases() -> dict[str, Case]:
     wall = lambda **kwargs: RegionPrior(Ball(torch.zeros(D), 1.0), "out", sharpness=2.0, **kwargs)  # noqa: E731
     return {
         "gaussian": Case(lambda: GaussianPrior(D), None),
         "goal": Case(lambda: GoalPrior(std=0.5, latent_dim=D, task_key="goal"), (D,)),
-        "mapped goal": Case(lambda: GoalPrior(nn.Linear(2, D), std=0.5), (2,)),
-        "function goal": Case(lambda: GoalPrior(sines, std=torch.ones(D)), (2,)),
+        "mapped goal": Case(lambda: GoalPrior(nn.Linear(2, D), std=0.5, task_key="goal"), (2,)),
+        "function goal": Case(lambda: GoalPrior(sines, std=torch.ones(D), task_key="goal"), (2,)),
         "image goal": Case(
-            lambda: GoalPrior(nn.Sequential(nn.Flatten(-2), nn.Linear(4, D)), std=0.5, task_ndim=2), (2, 2)
+            lambda: GoalPrior(
+                nn.Sequential(nn.Flatten(-2), nn.Linear(4, D)), std=0.5, task_ndim=2, task_key="goal"
+            ),
+            (2, 2),
         ),
         "energy": Case(lambda: EnergyPrior(size, latent_dim=D), None),
         "task energy": Case(lambda: EnergyPrior(pull, task_key="goal", latent_dim=D), (D,)),
@@ -66,15 +73,17 @@ def cases() -> dict[str, Case]:
         "sparsity": Case(lambda: SparsityPrior(D), None),
         "student": Case(lambda: SparsityPrior(D, degrees=3.0), None),
         "slowness": Case(lambda: SlownessPrior(D, 0.5, task_key="goal"), (D,)),
-        "probed": Case(lambda: ProbedPrior(GoalPrior(std=0.5), MATRIX), (P,)),
-        "square probe": Case(lambda: ProbedPrior(GoalPrior(std=0.5), torch.eye(D) + 0.1), (D,)),
+        "probed": Case(lambda: ProbedPrior(at_goal(), MATRIX), (P,)),
+        "square probe": Case(lambda: ProbedPrior(at_goal(), torch.eye(D) + 0.1), (D,)),
         "probed sparsity": Case(lambda: ProbedPrior(SparsityPrior(P), MATRIX), None),
-        "product": Case(lambda: ProductPrior(GoalPrior(std=0.5), wall(), weights=(2.0, 1.0)), (D,)),
+        "product": Case(lambda: ProductPrior(at_goal(), wall(), weights=(2.0, 1.0)), (D,)),
         "gaussian product": Case(
-            lambda: ProductPrior(ProbedPrior(GoalPrior(std=0.5), MATRIX), GaussianPrior(D)), (P,)
+            lambda: ProductPrior(ProbedPrior(at_goal(), MATRIX), GaussianPrior(D)),
+            (P,),
         ),
         "nested": Case(
-            lambda: ProductPrior(ProductPrior(GoalPrior(std=0.5), SparsityPrior(D)), GaussianPrior(D)), (D,)
+            lambda: ProductPrior(ProductPrior(at_goal(), SparsityPrior(D)), GaussianPrior(D)),
+            (D,),
         ),
     }
 
