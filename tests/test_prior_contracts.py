@@ -315,3 +315,9 @@ def test_the_trial_works_without_gradients_around() -> None:
         EnergyPrior(size, latent_dim=D)
     with torch.inference_mode():
         EnergyPrior(size, latent_dim=D)
+
+
+def test_a_task_that_is_needed_cannot_be_bound_to_nothing() -> None:
+    with pytest.raises(KeyError, match=r"task must hold the entries \['goal'\], got None"):
+        at_goal().bind(None)
+    assert GaussianPrior(D).bind(None).in_keys == []

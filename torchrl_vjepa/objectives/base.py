@@ -332,8 +332,8 @@ class LatentPredictionLoss(WindowLoss):
             which = "" if self.num_models is None else f" (model {int(rank.argmin())})"
             warnings.warn(
                 f"the latents have collapsed: effective rank {low:.2f} of {self.predictor.latent_dim}{which} "
-                f"is under collapse_rank={self.collapse_rank}; raise marginal_entropy_coeff or the VICReg "
-                "coefficients, or lower the learning rate",
+                f"is under collapse_rank={self.collapse_rank}; whiten the observations (Whitening), raise "
+                "marginal_entropy_coeff or the VICReg coefficients, or lower the learning rate",
                 CollapseWarning,
                 stacklevel=3,
             )

@@ -401,7 +401,8 @@ class WindowLoss(LossModule):
             elif not value.is_floating_point():
                 raise ValueError(
                     f"{key!r} must be floating point, got {value.dtype}; convert it first "
-                    "(ToTensorImage, DoubleToFloat, or ActionEncoder for multi-categorical actions)"
+                    "(ToTensorImage, DoubleToFloat; actions of n choices need action_dim=n, several of them "
+                    "an ActionEncoder)"
                 )
         longest = max(self.skips, default=0)
         if batch[-1] <= longest:

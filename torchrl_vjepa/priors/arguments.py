@@ -11,7 +11,7 @@ __all__ = ["affine_map", "as_constant", "finite_vector", "std_vector"]
 
 
 def as_constant(value: Tensor | float) -> Tensor:
-    """A tensor of the default dtype, unless it comes as one of another floating-point dtype already.
+    """A tensor of the default dtype, as parameters have it; ``.double()`` of the module changes both.
 
     Args:
         value: a number, or a tensor on any device.

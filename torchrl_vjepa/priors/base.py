@@ -245,6 +245,8 @@ class BoundPrior(Prior):
         self.differentiable = prior.differentiable
         self._keys: list[NestedKey] | None = None
         values: list[Tensor] = []
+        if task is None and prior.in_keys:
+            raise KeyError(f"task must hold the entries {prior.in_keys}, got None")
         if isinstance(task, Tensor):
             values = [task]
         elif task is not None:
