@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import asdict, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+import torch
+from torchrl import logger
 
 S = TypeVar("S")
 
@@ -57,3 +61,18 @@ def read_settings(
     given = {entry.name: getattr(args, entry.name) for entry in fields(settings)}
     given = {name: value for name, value in given.items() if value is not None}
     return replace(settings(), **{**(quick if args.quick else {}), **given}), args
+
+
+def prepare(args: argparse.Namespace) -> None:
+    """Folders for the results, and what every script tells torch."""
+    for path in (args.out, args.json.parent if args.json else args.out):
+        path.mkdir(parents=True, exist_ok=True)
+    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
+    # The tensors are small: a second process may help, more threads would only wait for each other.
+    torch.set_num_threads(1)
+
+
+def write_report(args: argparse.Namespace, settings: Any, **entries: Any) -> None:
+    """The settings and the results as JSON, if that was asked for."""
+    if args.json:
+        args.json.write_text(json.dumps({"settings": asdict(settings), **entries}, indent=1))

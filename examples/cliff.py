@@ -10,11 +10,10 @@ knows the true system.
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -31,7 +30,7 @@ from torchrl.modules import get_env_transforms_from_module
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     CEM,
     VJEPA,
@@ -362,10 +361,7 @@ def figure(rows: Sequence[Row], walked: dict[tuple[str, str], Tensor], path: Pat
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
     settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    # The tensors are small: more threads would only wait for each other.
-    torch.set_num_threads(1)
+    prepare(args)
     # A gust can throw the robot to where no plan is safe enough; the table counts what comes of it.
     warnings.filterwarnings("ignore", "no candidate plan satisfies", RuntimeWarning)
     start = time.perf_counter()
@@ -380,9 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = args.out / "cliff.png"
     figure(rows, shown, path)
     print(f"\n{wall:.0f} s; figure: {path}")
-    if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows}
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,9 @@ vehicle gets past it.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -24,12 +23,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution
-from torchrl import logger
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     VJEPA,
     BatchedForkEnv,
@@ -398,11 +396,7 @@ def figure(drawn: dict[str, Shown], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
     settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
-    # The tensors are small: more threads would only wait for each other.
-    torch.set_num_threads(1)
+    prepare(args)
     start = time.perf_counter()
     rows: list[Row] = []
     oracles: list[Row] = []
@@ -417,15 +411,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = args.out / "fork.png"
     figure(shown, path)
     print(f"\n{wall:.0f} s; figure: {path}")
-    if args.json:
-        result = {
-            "settings": asdict(settings),
-            "wall_s": wall,
-            "rows": rows,
-            "oracle": oracles,
-            "mean_in_wall": means,
-        }
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows, oracle=oracles, mean_in_wall=means)
 
 
 if __name__ == "__main__":

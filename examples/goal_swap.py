@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import copy
 import functools
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 from typing import Any, NamedTuple
@@ -26,7 +25,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl import logger
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.modules import get_env_transforms_from_module
 from tqdm import tqdm
@@ -53,7 +51,7 @@ from _noisy_tv import (
     train_reward,
     vjepa_loss,
 )
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     MPPI,
     Ball,
@@ -685,11 +683,7 @@ def figure(result: Result, path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
     settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
-    # The tensors are small: more threads would only wait for each other.
-    torch.set_num_threads(1)
+    prepare(args)
     start = time.perf_counter()
     results = [run_seed(seed, settings) for seed in settings.seeds]
     wall = time.perf_counter() - start
@@ -700,15 +694,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     figure(results[0], path)
     print(f"\nA task is swapped in {swap_ms:.2f} ms (median); the model is bit for bit as it was trained.")
     print(f"{wall:.0f} s; figure: {path}")
-    if args.json:
-        result = {
-            "settings": asdict(settings),
-            "wall_s": wall,
-            "swap_ms": swap_ms,
-            "rows": rows,
-            "diagnostics": [result.diagnostics for result in results],
-        }
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(
+        args,
+        settings,
+        wall_s=wall,
+        swap_ms=swap_ms,
+        rows=rows,
+        diagnostics=[result.diagnostics for result in results],
+    )
 
 
 if __name__ == "__main__":

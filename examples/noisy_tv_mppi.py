@@ -8,10 +8,9 @@ they pay, next to the LQG controller that knows the true system.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -20,7 +19,6 @@ import matplotlib as mpl
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl import logger
 from torchrl.envs import InitTracker, TransformedEnv
 from torchrl.modules import get_env_transforms_from_module
 from tqdm import tqdm
@@ -36,7 +34,7 @@ from _noisy_tv import (
     train_reward,
     vjepa_loss,
 )
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     MPPI,
     LatentEnv,
@@ -305,11 +303,7 @@ def figure(rows: Sequence[Row], episodes: Episodes, path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
     settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
-    # The tensors are small: more threads would only wait for each other.
-    torch.set_num_threads(1)
+    prepare(args)
     start = time.perf_counter()
     rows: list[Row] = []
     shown: Episodes = {}
@@ -322,9 +316,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = args.out / "noisy_tv_mppi.png"
     figure(rows, shown, path)
     print(f"\n{wall:.0f} s; figure: {path}")
-    if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows}
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows)
 
 
 if __name__ == "__main__":

@@ -10,12 +10,11 @@ system (Kalman filter), the labels (least squares), or neither (CCA of successiv
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -27,7 +26,7 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     BJEPA,
     JEPA,
@@ -711,10 +710,7 @@ def parse(arguments: Sequence[str] | None = None) -> tuple[Settings, argparse.Na
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the tables, draw the figures, write the JSON."""
     settings, args = parse(arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    # The tensors are small: a second process helps, a second thread would only wait.
-    torch.set_num_threads(1)
+    prepare(args)
     start = time.perf_counter()
     size = settings.seeds_per_batch or len(settings.seeds)
     batches = [tuple(settings.seeds[i : i + size]) for i in range(0, len(settings.seeds), size)]
@@ -752,9 +748,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(f"\nBJEPA, signal R2 fused minus unfused: {min(gains):+.4f} to {max(gains):+.4f}")
         print("\nfigures:", *draw(preset, mine, ideal, shown, settings, args.out), end="\n\n")
     print(f"{len(rows)} runs in {wall:.0f} s")
-    if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows, "fusion": fusion}
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows, fusion=fusion)
 
 
 def execute(work: Sequence[tuple[Any, ...]], workers: int) -> Iterator[Any]:

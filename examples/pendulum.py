@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import math
 import os
 import time
@@ -29,14 +28,13 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
-from torchrl import logger
 from torchrl.data import Bounded, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, GymEnv, SerialEnv, TransformedEnv
 from torchrl.modules import MLP, get_env_transforms_from_module
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     MPPI,
     VJEPA,
@@ -398,11 +396,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     if len(set(settings.seeds)) < len(settings.seeds):
         parser.error(f"--seeds must be distinct, got {settings.seeds}")
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
-    # The tensors are small: more threads would only wait for each other.
-    torch.set_num_threads(1)
+    prepare(args)
     if args.checkpoint is not None and args.checkpoint.exists():
         try:
             load(args.checkpoint, settings)  # refused before anything runs
@@ -413,8 +407,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = args.out / "pendulum.png"
     figure(result["rows"], result["references"], path)
     print(f"\n{result['wall_s']:.0f} s; figure: {path}")
-    if args.json:
-        args.json.write_text(json.dumps({"settings": asdict(settings), **result}, indent=1))
+    write_report(args, settings, **result)
 
 
 if __name__ == "__main__":

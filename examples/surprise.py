@@ -10,11 +10,10 @@ prediction of pixels is shown for comparison.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -26,7 +25,7 @@ from torch import Tensor
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     VJEPA,
     DiagGaussianHead,
@@ -301,9 +300,7 @@ def figure(rows: Sequence[Row], curves: dict[tuple[str, str], Tensor], path: Pat
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figure, write the JSON."""
     settings, args = read_settings(command_line(Settings, __doc__), Settings, QUICK, arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    torch.set_num_threads(1)  # the tensors are small: more threads would only wait for each other
+    prepare(args)
     start = time.perf_counter()
     systems = [LinearGaussianSystem(control_dim=2, seed=seed) for seed in settings.seeds]
     models = train(systems, settings)
@@ -318,9 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = args.out / "surprise.png"
     figure(rows, shown, path)
     print(f"\n{wall:.0f} s; figure: {path}")
-    if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows}
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,11 @@ steps holds n twice for every h, and its spread is fitted as it is.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
@@ -34,7 +33,7 @@ from torch.distributions import Distribution
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     VJEPA,
     DiagGaussianHead,
@@ -523,10 +522,7 @@ def execute(settings: Settings) -> Iterator[tuple[list[Row], list[Row], dict[flo
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print the table, draw the figures, write the JSON."""
     settings, args = parse(arguments)
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    # The tensors are small: a second process helps, a second thread would only wait.
-    torch.set_num_threads(1)
+    prepare(args)
     start = time.perf_counter()
     results = list(tqdm(execute(settings), total=len(settings.seeds), desc="seeds", leave=False))
     wall = time.perf_counter() - start
@@ -534,9 +530,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(table(routes, settings))
     print("\nfigures:", *draw(routes, results[0][2], settings, args.out))
     print(f"{len(settings.seeds)} seed(s) in {wall:.0f} s")
-    if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows, "routes": routes}
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows, routes=routes)
 
 
 if __name__ == "__main__":
