@@ -188,6 +188,7 @@ class GradientMPC(Planner):
         x.requires_grad_()
         found = _Incumbent(proposal.mean)
         noise = self._model_generator.get_state()
+        cost_of = self._evaluator(state)
 
         def evaluate() -> Tensor:
             """Costs ``(*B, S)`` at the variables."""
@@ -197,7 +198,7 @@ class GradientMPC(Planner):
             actions = fixed + (value - value.detach())
             # The model's noise is the same in every step: their costs compare.
             self._model_generator.set_state(noise)
-            cost = self._evaluate(state, actions)
+            cost = cost_of(actions)
             finite = actions.detach().isfinite().flatten(-2).all(dim=-1)
             cost = torch.where(finite, cost, math.inf)
             found.offer(actions.detach(), cost.detach())
