@@ -3,17 +3,16 @@
 The first steps are random. In each round VJEPA learns from a replay buffer how latents move, a termination
 head learns where episodes end, and categorical CEM plans in the model and collects the next steps, some at
 random. Nobody tells a reward: a plan costs what a predicted end costs, and the energy of a Gaussian prior
-around the latents in which episodes begin. When all is learned, categorical CEM and tree search plan in the
-same model for the same 100 evaluation episodes; the table says how long the pole stands.
+around the latents in which episodes begin. When all is learned, every one of ``--planners`` plans in the same
+model for the same 100 evaluation episodes; the table says how long the pole stands.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -24,14 +23,13 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl import logger
 from torchrl.data import LazyTensorStorage, OneHot, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import GymEnv, InitTracker, SerialEnv, TransformedEnv
 from torchrl.modules import MLP, EGreedyModule, get_env_transforms_from_module
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from _settings import command_line, option, read_settings
+from _settings import command_line, option, prepare, read_settings, write_report
 from torchrl_vjepa import (
     CEM,
     VJEPA,
@@ -60,6 +58,7 @@ LABELS = {
     "tree-search": "tree search",
     "random": "random actions",
 }
+STYLES = {"categorical-cem": "-", "tree-search": "--", "random": ":"}
 COLORS = {"categorical-cem": "#0072B2", "tree-search": "#D55E00", "random": "0.45"}
 PARTS = ("observation", "action", ("next", "reward"), ("next", "terminated"), ("next", "done"))
 Row = dict[str, Any]
@@ -89,6 +88,11 @@ class Settings:
     num_candidates: int = option(64, "plans in a CEM round")
     search_horizon: int = option(50, "steps that tree search looks ahead")
     num_simulations: int = option(16, "simulations of tree search for each action")
+    planners: list[str] = option(
+        ["categorical-cem", "random"],
+        "who is evaluated; tree search to this depth takes many times as long as CEM",
+        choices=list(LABELS),
+    )
     episodes: int = option(100, "evaluation episodes, the same for every planner and seed")
 
 
@@ -101,6 +105,7 @@ QUICK = {
     "search_horizon": 4,
     "num_simulations": 4,
     "num_candidates": 16,
+    "planners": list(LABELS),
     "episodes": 4,
 }
 
@@ -295,7 +300,7 @@ def run_seed(seed: int, settings: Settings) -> tuple[list[Row], list[tuple[int, 
     run = Run(seed, settings)
     run.learn()
     rows, returns = [], {}
-    for name in tqdm(LABELS, desc=f"seed {seed}: evaluate", leave=False):
+    for name in tqdm(settings.planners, desc=f"seed {seed}: evaluate", leave=False):
         row, returns[name] = run.evaluate(name)
         rows.append(row)
     return rows, run.lengths, returns
@@ -333,7 +338,9 @@ def figure(
         xlim=(0, None),
     )
     learned.legend(frameon=False)
-    for name, style in zip(LABELS, ("-", "--", ":"), strict=True):
+    for name, style in STYLES.items():
+        if name not in next(iter(returns.values())):
+            continue
         values = torch.cat([here[name] for here in returns.values()])
         length = torch.arange(1, EPISODE + 1)
         share = (values >= length.unsqueeze(1)).float().mean(1)
@@ -364,11 +371,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 f"--{name.replace('_', '-')} must be a positive multiple of "
                 f"--collect-envs={settings.collect_envs}, got {steps}"
             )
-    for path in (args.out, args.json.parent if args.json else args.out):
-        path.mkdir(parents=True, exist_ok=True)
-    logger.setLevel("WARNING")  # TorchRL tells of every storage that it makes
-    # The tensors are small: more threads would only wait for each other.
-    torch.set_num_threads(1)
+    prepare(args)
     start = time.perf_counter()
     rows: list[Row] = []
     curves: dict[int, list[tuple[int, float]]] = {}
@@ -382,9 +385,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = args.out / "cartpole.png"
     figure(curves, returns, path)
     print(f"\n{wall:.0f} s; figure: {path}")
-    if args.json:
-        result = {"settings": asdict(settings), "wall_s": wall, "rows": rows, "curves": curves}
-        args.json.write_text(json.dumps(result, indent=1))
+    write_report(args, settings, wall_s=wall, rows=rows, curves=curves)
 
 
 if __name__ == "__main__":

@@ -332,7 +332,7 @@ def check_cartpole_report(report: dict[str, Any]) -> None:
     """Checks the report of ``cartpole.py``: one row for each planner and seed."""
     assert set(report) == {"settings", "wall_s", "rows", "curves"}
     settings, rows = report["settings"], report["rows"]
-    planners = ("categorical-cem", "tree-search", "random")
+    planners = settings["planners"]
     assert [(row["seed"], row["planner"]) for row in rows] == [
         (seed, planner) for seed in settings["seeds"] for planner in planners
     ]
