@@ -159,7 +159,7 @@ def test_the_target_encoder_reads_the_encoders_own_buffers() -> None:
         (lambda: GoalPrior(std=-1.0), ValueError, "std must be positive, got"),
         (lambda: GoalPrior(std=math.nan), ValueError, "std must be a finite number"),
         (lambda: GoalPrior(std=torch.ones(2), latent_dim=D), ValueError, r"of shape \(3,\)"),
-        (lambda: GoalPrior(3, std=1.0), TypeError, "mapper must be callable or None, got int"),  # type: ignore[arg-type]
+        (lambda: GoalPrior(3, std=1.0), TypeError, "mapper must be callable or None, got int"),  # type: ignore[arg-type] (meant)
         (
             lambda: GoalPrior(
                 TensorDictModule(nn.Bilinear(2, 2, D), in_keys=["a", "b"], out_keys=["latent"]), std=1.0

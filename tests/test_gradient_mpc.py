@@ -348,7 +348,7 @@ class TestNotFinite:
         told: list[float] = []
 
         class Listen(torch.optim.SGD):
-            def step(self, closure: Any) -> None:  # type: ignore[override]
+            def step(self, closure: Any) -> None:  # type: ignore[override] (torch's has overloads)
                 told.append(float(closure()))
 
         def cost(latent: Tensor, action: Tensor) -> Tensor:
@@ -428,7 +428,7 @@ class _Poison(torch.optim.Optimizer):
     def __init__(self, variables: list[Tensor]) -> None:
         super().__init__(variables, {})
 
-    def step(self, closure: Any) -> None:  # type: ignore[override]
+    def step(self, closure: Any) -> None:  # type: ignore[override] (torch's has overloads)
         closure()
         with torch.no_grad():
             self.param_groups[0]["params"][0].fill_(math.nan)

@@ -278,7 +278,7 @@ def test_bad_covariances_are_refused(covariance: Tensor, message: str) -> None:
 
 def test_bad_input_is_refused() -> None:
     with pytest.raises(ValueError, match="method must be 'linearize' or 'sigma_points', got 'exact'"):
-        propagate_moments(_never, torch.zeros(3), torch.zeros(5, 2), "exact")  # type: ignore[arg-type]
+        propagate_moments(_never, torch.zeros(3), torch.zeros(5, 2), "exact")  # type: ignore[arg-type] (meant)
     with pytest.raises(ValueError, match=r"actions must have shape \(\*B, H, A\)"):
         propagate_moments(_never, torch.zeros(3), torch.zeros(0, 2))
     matrices = Independent(Normal(torch.zeros(3, 2), 1.0), 2)

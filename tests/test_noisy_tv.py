@@ -55,7 +55,7 @@ def rng_states_untouched():
     numpy_state = np.random.get_state()[1].copy()  # noqa: NPY002 (the global one is meant)
     yield
     assert torch.equal(torch.get_rng_state(), torch_state)
-    np.testing.assert_array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002
+    np.testing.assert_array_equal(np.random.get_state()[1], numpy_state)  # noqa: NPY002 (the same)
 
 
 # ---------------------------------------------------------------- system: matrices

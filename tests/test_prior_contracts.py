@@ -53,8 +53,11 @@ def at_goal() -> GoalPrior:
     return GoalPrior(std=0.5, task_key="goal")
 
 
+def wall(task_key: str | None = None) -> RegionPrior:
+    return RegionPrior(Ball(torch.zeros(D), 1.0), "out", sharpness=2.0, task_key=task_key)
+
+
 def cases() -> dict[str, Case]:
-    wall = lambda **kwargs: RegionPrior(Ball(torch.zeros(D), 1.0), "out", sharpness=2.0, **kwargs)  # noqa: E731
     return {
         "gaussian": Case(lambda: GaussianPrior(D), None),
         "goal": Case(lambda: GoalPrior(std=0.5, latent_dim=D, task_key="goal"), (D,)),
