@@ -73,7 +73,7 @@ def states(num: int = 3) -> TensorDict:
     return TensorDict(latent=latent, batch_size=num)
 
 
-class TestPointStep:
+class TestPointRollout:
     @pytest.mark.parametrize("head", HEADS)
     @pytest.mark.parametrize("residual", [False, True])
     @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ class TestPointStep:
         predictor.set_temperature([2.0, 3.0])
         latent, actions = torch.randn(2, 5, 3), torch.randn(2, 5, 4, 2)
         with torch.set_grad_enabled(grad):
-            assert predictor.point_step(latent[0], actions[0, :, 0]) is not None
+            assert predictor.point_rollout(latent[0], actions[0, :, 0]) is not None
             for how in ("mean", "mode"):
                 out = rollout(predictor.dist, latent, actions, how)
                 torch.testing.assert_close(out, by_steps(predictor, latent, actions), atol=1e-5, rtol=1e-5)
@@ -123,9 +123,9 @@ class TestPointStep:
         latent, actions = torch.randn(5, 3), torch.randn(5, 4, 2)
 
         def same(predictor: Predictor) -> bool:
-            step = predictor.point_step(latent, actions[:, 0])
+            move = predictor.point_rollout(latent, actions[:, 0])
             out = rollout(predictor.dist, latent, actions)
-            return step is None and torch.equal(out, by_steps(predictor, latent, actions))
+            return move is None and torch.equal(out, by_steps(predictor, latent, actions))
 
         assert same(Predictor(3, 2, head=EnsembleHead(num_members=2)))
         assert same(Predictor(3, 2, head=Shifted()))

@@ -14,7 +14,7 @@ from torchrl_vjepa.distributions import point_estimate
 __all__ = ["PreparedTransition", "Transition", "check_plan", "rollout"]
 
 Transition = Callable[[Tensor, Tensor], Distribution]
-PointStep = Callable[[Tensor, Tensor], Tensor]
+PointRollout = Callable[[Tensor, Tensor], Tensor]
 
 
 def rollout(
@@ -125,9 +125,12 @@ def _roll(
     generator: torch.Generator | None,
 ) -> Tensor:
     if how != "sample" and latent.numel() and actions.numel():
-        step = PreparedTransition.of(transition).point_step(latent, actions)
-        if step is not None:
-            return _points(step, latent, actions)
+        move = PreparedTransition.of(transition).point_rollout(latent, actions)
+        if move is not None:
+            horizon, size = actions.shape[-2], latent.shape[-1]
+            rows = latent.reshape(-1, size)
+            latents = move(rows, actions.reshape(len(rows), horizon, actions.shape[-1]))
+            return latents.view(*latent.shape[:-1], horizon, size)
     latents = []
     for action in actions.unbind(-2):
         latent = point_estimate(transition(latent, action), how, generator=generator)
@@ -138,13 +141,13 @@ def _roll(
 class PreparedTransition:
     """A transition that is iterated several times from latents and actions of the same shape.
 
-    A method ``dist`` whose owner has a ``point_step``, as
+    A method ``dist`` whose owner has a ``point_rollout``, as
     :class:`~torchrl_vjepa.predictor.Predictor` has, is then prepared once for all rollouts of mean and
     mode: the weights that it has at the first rollout count.
 
     Args:
         transition: ``(latent (*B, D), action (*B, A)) -> Distribution``.
-        dtype: what networks compute in: a ``point_step`` by weights of that dtype, others by autocast;
+        dtype: what networks compute in: a ``point_rollout`` by weights of that dtype, others by autocast;
             ``None``: as they do without.
 
     Examples:
@@ -157,7 +160,7 @@ class PreparedTransition:
 
     def __init__(self, transition: Transition, dtype: torch.dtype | None = None) -> None:
         self.transition, self.dtype = transition, dtype
-        self._step: PointStep | None = None
+        self._move: PointRollout | None = None
         self._example: tuple[Any, ...] | None = None
 
     @classmethod
@@ -187,7 +190,7 @@ class PreparedTransition:
         with torch.autocast(latent.device.type, self.dtype):
             return self.transition(latent, action)
 
-    def point_step(self, latent: Tensor, actions: Tensor) -> PointStep | None:
+    def point_rollout(self, latent: Tensor, actions: Tensor) -> PointRollout | None:
         """The short way to mean and mode, where the owner of the transition knows one.
 
         Args:
@@ -195,25 +198,15 @@ class PreparedTransition:
             actions: its plan, of shape ``(*B, H, A)``.
 
         Returns:
-            ``(latent (R, D), action (R, A)) -> (R, D)``, or ``None``.
+            ``(latent (R, D), actions (R, H, A)) -> (R, H, D)``, or ``None``.
         """
         example = (latent.shape[-1], actions.shape[-1], latent.dtype, actions.dtype, torch.is_grad_enabled())
         if self._example != example:
             owner = getattr(self.transition, "__self__", None)
-            prepare = getattr(owner, "point_step", None)
-            self._step = None
+            prepare = getattr(owner, "point_rollout", None)
+            self._move = None
             if prepare is not None and self.transition == getattr(owner, "dist", None):
                 rows = latent.reshape(-1, latent.shape[-1])[:1]
-                self._step = prepare(rows, actions.reshape(-1, actions.shape[-1])[:1], self.dtype)
+                self._move = prepare(rows, actions.reshape(-1, actions.shape[-1])[:1], self.dtype)
             self._example = example
-        return self._step
-
-
-def _points(step: PointStep, latent: Tensor, actions: Tensor) -> Tensor:
-    horizon, action_dim = actions.shape[-2:]
-    rows = latent.reshape(-1, latent.shape[-1])
-    latents = []
-    for action in actions.reshape(len(rows), horizon, action_dim).unbind(1):
-        rows = step(rows, action)
-        latents.append(rows)
-    return torch.stack(latents, dim=1).reshape(*latent.shape[:-1], horizon, -1)
+        return self._move

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -15,6 +15,7 @@ from torchrl.modules import MLP
 
 from torchrl_vjepa.heads import DiagGaussianHead, Head
 from torchrl_vjepa.predictor.model import PredictiveModel
+from torchrl_vjepa.predictor.points import PointRollout
 from torchrl_vjepa.predictor.trunks import linear_and_others
 from torchrl_vjepa.stacking import is_plain_linear, linear
 from torchrl_vjepa.temperature import temper
@@ -246,24 +247,24 @@ class Predictor(PredictiveModel):
         plain = all(map(is_plain_linear, self.trunks))
         return plain and self.head.stackable and self.temperature is None
 
-    def point_step(
+    def point_rollout(
         self, latent: Tensor, action: Tensor, dtype: torch.dtype | None = None
-    ) -> Callable[[Tensor, Tensor], Tensor] | None:
-        r"""The mean of :meth:`dist` one step ahead, prepared for many calls with inputs of one shape.
+    ) -> PointRollout | None:
+        r"""The mean of :meth:`dist` one step ahead, prepared to be iterated along plans of one shape.
 
         What does not change from call to call is done once: inputs are checked, weights are read, the
         one-hot skip becomes a bias; and of the head's features only the mean is computed. Where gradients
-        are off, activations work in place. :func:`~torchrl_vjepa.belief.rollout` iterates it.
+        are off, steps and activations work in place. :func:`~torchrl_vjepa.belief.rollout` uses it.
 
         Args:
-            latent: an example of what it will be called with, of shape ``(R, D)``.
-            action: likewise, of shape ``(R, A)``.
+            latent: an example of where plans start, of shape ``(R, D)``.
+            action: an example of one of their steps, of shape ``(R, A)``.
             dtype: what the network computes in, for instance ``torch.bfloat16``; latents come and go in
                 theirs. ``None``: the dtype of the weights.
 
         Returns:
-            ``(latent, action) -> next latent``, which is mean and mode; ``None`` where there is no such
-            short way: a head that computes its mean from all features
+            ``(latent (R, D), actions (R, H, A)) -> latents (R, H, D)``, of means, which are modes; ``None``
+            where there is no such short way: a head that computes its mean from all features
             (:class:`~torchrl_vjepa.heads.base.Head`), hooks, a trunk or a ``dist`` of a subclass.
 
         Raises:
@@ -273,9 +274,10 @@ class Predictor(PredictiveModel):
         Examples:
             >>> import torch
             >>> predictor = Predictor(4, action_dim=2, trunk="mlp")
-            >>> latent, action = torch.ones(7, 4), torch.ones(7, 2)
-            >>> step = predictor.point_step(latent, action)
-            >>> torch.allclose(step(latent, action), predictor.dist(latent, action).mean, atol=1e-6)
+            >>> latent, actions = torch.ones(7, 4), torch.ones(7, 3, 2)
+            >>> move = predictor.point_rollout(latent, actions[:, 0])
+            >>> first = predictor.dist(latent, actions[:, 0]).mean
+            >>> torch.allclose(move(latent, actions)[:, 0], first, atol=1e-6)
             True
         """
         index = self._index(latent, 1)
@@ -292,39 +294,22 @@ class Predictor(PredictiveModel):
         layers = linear_and_others(trunk)
         if layers is None or layers[0].weight.ndim != 2:
             return None
-        size, action_dim, residual = self.latent_dim, self.action_dim, self.residual
-        last = len(layers) - 1
-        steps: list[Callable[[Tensor], Tensor]] = []
+        size, last = self.latent_dim, len(layers) - 1
+        joined = size + self.action_dim
         for place, layer in enumerate(layers):
             if not isinstance(layer, nn.Linear):
-                hooked = layer._forward_hooks or layer._forward_pre_hooks
-                steps.append(layer if hooked else layer.forward)
                 continue
             weight: Tensor = layer.weight
             bias: Tensor | None = layer.bias
             if place == 0 and self.trunk == "mlp":
-                constant = weight.select(1, size + max(self.skips) * action_dim + index)
+                constant = weight.select(1, size + max(self.skips) * self.action_dim + index)
                 bias = constant if bias is None else bias + constant
-                weight = weight.narrow(1, 0, size + action_dim)
-            if place == last and head.num_features(size) > size:
+                weight = weight.narrow(1, 0, joined)
+            if place == last and len(weight) > size:
                 weight = weight.narrow(0, 0, size)
                 bias = None if bias is None else bias.narrow(0, 0, size)
-            bias = weight.new_zeros(()) if bias is None else bias
-            if dtype is not None:
-                weight, bias = weight.to(dtype), bias.to(dtype)
-            steps.append(functools.partial(torch.addmm, bias, mat2=weight.t()))
-
-        def step(latent: Tensor, action: Tensor) -> Tensor:
-            x = torch.cat([latent, action], dim=-1) if action_dim else latent
-            if dtype is not None:
-                x = x.to(dtype)
-            for layer in steps:
-                x = layer(x)
-            if dtype is not None:
-                x = x.to(latent.dtype)
-            return latent + x if residual else x
-
-        return step
+            layers[place] = (weight, weight.new_zeros(()) if bias is None else bias)
+        return PointRollout(layers, self.residual, dtype)
 
     def _index(self, latent: Tensor, skip: int) -> int:
         """Place of a skip, where it was learned and the latent fits."""
