@@ -170,8 +170,7 @@ class _QuadraticCost(Cost):
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
         if self.weight.ndim == 2:
             return _quadratic_form(latent - self.target, self.weight)
-        target = self.target.expand_as(latent)
-        return _weighted_squares(F.mse_loss(latent, target, reduction="none"), self.weight)
+        return _weighted_squares((latent - self.target).square_(), self.weight)
 
 
 class _ActionCost(Cost):

@@ -52,8 +52,23 @@ class CEM(SamplingPlanner):
         Returns:
             The next proposal.
         """
-        weights = (costs < torch.inf).to(elites.dtype)
-        return weighted_gaussian(elites, weights, proposal.mean)
+        return weighted_gaussian(elites, uniform_weights(costs), proposal.mean)
+
+
+def uniform_weights(costs: Tensor) -> Tensor:
+    """The same weight for all elites of finite cost.
+
+    Args:
+        costs: finite or plus infinity, of shape ``(*B, K)``.
+
+    Returns:
+        Weights of shape ``(*B, K)`` with sum one, ``nan`` where no cost is finite.
+
+    Examples:
+        >>> uniform_weights(torch.tensor([1.0, 7.0, torch.inf]))
+        tensor([0.5000, 0.5000, 0.0000])
+    """
+    return (costs - costs).nan_to_num(-torch.inf).softmax(dim=-1)
 
 
 def weighted_gaussian(elites: Tensor, weights: Tensor, previous_mean: Tensor) -> Proposal:
@@ -65,21 +80,21 @@ def weighted_gaussian(elites: Tensor, weights: Tensor, previous_mean: Tensor) ->
 
     Args:
         elites: of shape ``(*B, K, H, A)``.
-        weights: non-negative, of shape ``(*B, K)``; normalised here.
+        weights: of shape ``(*B, K)``, with sum one.
         previous_mean: :math:`\mu`, of shape ``(*B, H, A)``.
 
     Returns:
-        The proposal; not finite where all weights are zero.
+        The proposal.
 
     Examples:
         >>> import torch
         >>> elites = torch.tensor([1.0, 7.0]).reshape(2, 1, 1)
-        >>> weighted_gaussian(elites, torch.ones(2), torch.zeros(1, 1))
+        >>> weighted_gaussian(elites, torch.tensor([0.5, 0.5]), torch.zeros(1, 1))
         Proposal(mean=tensor([[4.]]), std=tensor([[5.]]))
     """
     batch, num, shape = weights.shape[:-1].numel(), weights.shape[-1], previous_mean.shape
     size = shape[-2:].numel()
-    w = (weights / weights.sum(dim=-1, keepdim=True)).reshape(batch, 1, num)
+    w = weights.reshape(batch, 1, num)
     squares = (elites - previous_mean.unsqueeze(-3)).square_()
     # Products of matrices: a third of the time of sums over the third dimension from the end.
     mean = torch.bmm(w, elites.reshape(batch, num, size)).reshape(shape)

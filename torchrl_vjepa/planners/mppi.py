@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.planners.cem import weighted_gaussian
+from torchrl_vjepa.planners.cem import uniform_weights, weighted_gaussian
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.sampling import SamplingPlanner
 
@@ -92,17 +92,19 @@ class MPPI(SamplingPlanner):
         Returns:
             The next proposal.
         """
-        finite = costs < math.inf
         # The lowest cost is subtracted first, so the largest exponent is 0 at any magnitude.
-        limits = torch.finfo(costs.dtype)
-        excess = torch.where(finite, (costs - costs[..., :1]).clamp_max(limits.max), 0.0)
-        if self.normalize_costs:
-            # In units of the largest excess, so that the square below cannot overflow.
-            largest = excess.amax(dim=-1, keepdim=True)
-            excess = excess / largest.clamp_min(limits.tiny)
-            num = finite.sum(dim=-1, keepdim=True)
-            mean = excess.sum(dim=-1, keepdim=True) / num
-            variance = torch.where(finite, excess - mean, 0.0).square().sum(-1, keepdim=True) / num
-            excess = excess / variance.sqrt().clamp_min(limits.eps)
-        weights = torch.where(finite, torch.exp(-excess / self.temperature), 0.0)
-        return weighted_gaussian(elites, weights, proposal.mean)
+        if not self.normalize_costs:
+            excess = (costs - costs.narrow(-1, 0, 1)) / -self.temperature
+            return weighted_gaussian(elites, excess.softmax(dim=-1), proposal.mean)
+        # Of halves, whose difference cannot overflow: the scale of costs does not matter.
+        costs = 0.5 * costs
+        excess = costs - costs.narrow(-1, 0, 1)
+        limits, uniform = torch.finfo(costs.dtype), uniform_weights(costs)
+        # In units of the largest excess, so that the square below cannot overflow.
+        finite = excess.nan_to_num(0.0, 0.0)
+        largest = finite.amax(dim=-1, keepdim=True).clamp_min(limits.tiny)
+        finite = finite / largest
+        deviation = finite - (uniform * finite).sum(dim=-1, keepdim=True)
+        variance = (uniform * deviation.square_()).sum(dim=-1, keepdim=True)
+        scale = (variance.sqrt_() * largest).mul_(-self.temperature).clamp_(-limits.max, -limits.tiny)
+        return weighted_gaussian(elites, (excess / scale).softmax(dim=-1), proposal.mean)

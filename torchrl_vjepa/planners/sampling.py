@@ -166,7 +166,8 @@ class SamplingPlanner(Planner):
         """
         codec, family = self.codec, self.family
         best = codec.mode(proposal.mean)
-        best_cost = best.new_full(best.shape[:-2], math.inf)
+        # Costs keep the dimensions of a plan, (*B, 1, 1): they choose between plans.
+        best_cost = infinite = best.new_full((*best.shape[:-2], 1, 1), math.inf)
         generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
@@ -181,20 +182,20 @@ class SamplingPlanner(Planner):
             if constrained:
                 feasible = elite_costs < REJECTED_COST
                 elite_costs = torch.where(feasible[..., :1] & ~feasible, math.inf, elite_costs)
-            index = index.unsqueeze(-1).unsqueeze(-1).expand(*index.shape, *candidates.shape[-2:])
+            index = index[..., None, None].expand(*index.shape, *candidates.shape[-2:])
             elites = candidates.gather(-3, index)
-            kept = elites[..., 1 : 1 + self._num_kept, :, :]
-            lowest = elite_costs.select(-1, 0)  # infinite where no cost is finite
-            better = (lowest < best_cost).unsqueeze(-1).unsqueeze(-1)
-            best = torch.where(better, elites.select(-3, 0), best)
+            kept = elites[..., 1 : 1 + self._num_kept, :, :] if self._num_kept else None
+            lowest = elite_costs.narrow(-1, 0, 1).unsqueeze(-1)  # infinite where no cost is finite
+            best = torch.where(lowest < best_cost, elites.select(-3, 0), best)
             best_cost = torch.minimum(lowest, best_cost)
             mean, std = self.update(proposal, elites, elite_costs)
-            found = (lowest < math.inf).unsqueeze(-1).unsqueeze(-1)
+            found = lowest < infinite
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
             proposal = family.confine(Proposal(mean, std), self.min_std)
             if clock is not None and not clock.another(best_cost):
                 break
+        best_cost = best_cost[..., 0, 0]
         actions = codec.mode(proposal.mean) if self.output == "mean" else best
         if self._constrained and self.output == "mean":
             # The mean of feasible plans may be none (around an obstacle it lies in it).
@@ -240,7 +241,7 @@ class SamplingPlanner(Planner):
             candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
-        if kept is not None and self._num_kept:
+        if kept is not None:
             candidates[..., num - self._num_kept :, :, :] = kept
         return candidates
 
