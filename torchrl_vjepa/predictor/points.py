@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,17 +35,17 @@ class PointRollout:
     ) -> None:
         self.residual, self.dtype = residual, dtype
         self.watched = False  # by hooks, which may keep what they see
-        self.hidden: list[Any] = []
+        affine: list[tuple[Tensor, Tensor, list[Any]]] = []  # and what follows each
         for layer in layers:
             if isinstance(layer, tuple):
                 weight, bias = layer if dtype is None else (part.to(dtype) for part in layer)
-                self.hidden.append((weight.t(), bias))
+                affine.append((bias, weight.t(), []))
             elif layer._forward_hooks or layer._forward_pre_hooks:
-                self.hidden.append(layer)
+                affine[-1][2].append(layer)
                 self.watched = True
             else:
-                self.hidden.append(layer.forward)
-        self.weight, self.bias = self.hidden.pop()
+                affine[-1][2].append(layer.forward)
+        *self.hidden, (self.bias, self.weight, _) = affine
 
     def __call__(self, latent: Tensor, actions: Tensor) -> Tensor:
         """Latents along the plans.
@@ -71,18 +70,17 @@ class PointRollout:
         joined.select(0, 0).narrow(1, 0, size).copy_(latent)
         following = joined.narrow(0, 1, horizon).narrow(2, 0, size)
         following.copy_(self.bias)  # of all steps at once, to which the last layer adds
-        hidden: list[Any] = []
-        for layer in self.hidden:
-            if isinstance(layer, tuple):
-                weight, bias = layer
-                out = latent.new_empty((num, weight.shape[1]), dtype=dtype)
-                layer = functools.partial(torch.addmm, bias, mat2=weight, out=out)
-            hidden.append(layer)
-        weight, residual = self.weight, self.residual
+        hidden = [
+            (bias, weight, latent.new_empty((num, weight.shape[1]), dtype=dtype), others)
+            for bias, weight, others in self.hidden
+        ]
+        weight, residual, addmm = self.weight, self.residual, torch.addmm
         for inputs, out in zip(joined.unbind(0), following.unbind(0), strict=False):
             x = inputs
-            for layer in hidden:
-                x = layer(x)
+            for bias, matrix, buffer, others in hidden:
+                x = addmm(bias, x, matrix, out=buffer)
+                for other in others:
+                    x = other(x)
             out.addmm_(x, weight)
             if residual:
                 out.add_(inputs.narrow(1, 0, size))
@@ -94,8 +92,10 @@ class PointRollout:
             x = torch.cat([latent, action], dim=-1)
             if self.dtype is not None:
                 x = x.to(self.dtype)
-            for layer in self.hidden:
-                x = torch.addmm(layer[1], x, layer[0]) if isinstance(layer, tuple) else layer(x)
+            for bias, weight, others in self.hidden:
+                x = torch.addmm(bias, x, weight)
+                for other in others:
+                    x = other(x)
             x = torch.addmm(self.bias, x, self.weight)
             if self.dtype is not None:
                 x = x.to(latent.dtype)
