@@ -8,7 +8,7 @@ better. :class:`LatentEnv` answers both on plain tensors.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -31,13 +31,20 @@ from torchrl_vjepa.imagination import (
     read_state,
 )
 from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
-from torchrl_vjepa.priors import Prior
+from torchrl_vjepa.priors import LatentDensity, Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 
 __all__ = ["LatentEnv"]
 
 #: Trajectories per plan where a belief is given and no number: one particle would be a matter of luck.
 BELIEF_SAMPLES = 64
+
+
+class _PlanPrior(NamedTuple):
+    """What a prior gives along plans of one horizon: for all steps at once, and for each; where needed."""
+
+    whole: LatentDensity | None
+    at: Callable[[int], LatentDensity] | None
 
 
 class LatentEnv(ModelBasedEnvBase):
@@ -349,31 +356,36 @@ class LatentEnv(ModelBasedEnvBase):
             **settings: ``num_samples``, ``risk``, ``constraints``, ``fusion``; see :meth:`objective`.
 
         Returns:
-            ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes.
+            ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes. What
+            the prior gives for the tasks is made at its first call: gradients of later ones are for actions.
         """
         given = self.sampling(**settings)
         if given.fusion == "propose" and self.rollout_dtype is not None:
             raise ValueError(f"rollout_dtype must be None for fusion='propose', got {self.rollout_dtype}")
         world_model = self.world_model
         transition = PreparedTransition(world_model.transition, self.rollout_dtype)
+        prior_of: dict[int, _PlanPrior] = {}  # by horizon
 
         def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
             start, actions = self._start(state, actions, given.num_samples, generator)
-            tasks = self._tasks(state, actions)
-            if given.fusion == "propose":
-                prior_at = densities(world_model.prior, tasks, actions.ndim - 3)
+            prior = prior_of.get(actions.shape[-2])
+            if prior is None:
+                prior = prior_of[actions.shape[-2]] = self._plan_prior(state, actions, given.fusion)
+            if prior.at is not None:
                 latents, evidence = imagine_fused(
-                    transition, start, actions, prior_at, generator, self.num_particles
+                    transition, start, actions, prior.at, generator, self.num_particles
                 )
                 if actions.requires_grad and not evidence.requires_grad:
                     raise ValueError(NO_GRADIENT)
-                costs = world_model.fused_cost(latents, actions, evidence, tasks)
+                costs = world_model.fused_cost(latents, actions, evidence, prior.whole)
                 if given.constraints:  # what violates is what the dynamics do, not what the prior asks for
                     latents = imagine(transition, start, actions, "sample", generator)
             else:
                 latents = imagine(transition, start, actions, self._following(state, given), generator)
                 latents, needs_gradient = latents.to(start.dtype), actions.requires_grad
-                costs = world_model.stage_cost(latents, actions, tasks, needs_gradient=needs_gradient)
+                costs = world_model.stage_cost(
+                    latents, actions, density=prior.whole, needs_gradient=needs_gradient
+                )
                 costs = world_model.until_end(costs, latents, actions)
             costs = costs.sum(dim=-1)
             if given.num_samples is None:
@@ -427,6 +439,16 @@ class LatentEnv(ModelBasedEnvBase):
         """How the next latent is chosen: what starts from a belief may be sampled at its start alone."""
         from_belief = self.belief_key is not None and not isinstance(state, Tensor)
         return self.how if settings.num_samples is None or from_belief else "sample"
+
+    def _plan_prior(self, state: Tensor | TensorDictBase, actions: Tensor, fusion: str) -> _PlanPrior:
+        prior, proposes = self.world_model.prior, fusion == "propose"
+        if prior is None:
+            return _PlanPrior(None, None)
+        tasks = self._tasks(state, actions)
+        at = densities(prior, tasks, actions.ndim - 3) if proposes else None
+        if proposes and self.world_model.termination_model is None:
+            return _PlanPrior(None, at)
+        return _PlanPrior(prior.density(self.latent_dim, tasks), at)
 
     def _tasks(self, state: Tensor | TensorDictBase, actions: Tensor) -> Tasks | None:
         """Tasks of every step, ``(*B, 1, H or 1, *task)``: they broadcast against ``(M, *B, N, H)``."""

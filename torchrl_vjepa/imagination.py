@@ -56,7 +56,7 @@ def check_prior(prior: Prior | None, latent_dim: int, device: torch.device) -> N
 
 
 def densities(prior: Prior, tasks: Tasks | None, time_dim: int) -> Callable[[int], LatentDensity]:
-    """The density of a prior at each step of a plan.
+    """The density of a prior at each step of a plan, made once where the task is the same.
 
     Args:
         prior: the prior.
@@ -73,13 +73,15 @@ def densities(prior: Prior, tasks: Tasks | None, time_dim: int) -> Callable[[int
         >>> densities(GoalPrior(std=1.0), path, time_dim=1)(2).mean
         tensor([[2.]])
     """
-    if tasks is None:
-        same = prior(None)
-        return lambda k: same
+    known: dict[tuple[int, ...], LatentDensity] = {}
 
     def at(k: int) -> LatentDensity:
-        steps = {key: (value, min(k, value.shape[time_dim] - 1)) for key, value in tasks.items()}
-        return prior({key: value.select(time_dim, index) for key, (value, index) in steps.items()})
+        steps = {key: min(k, value.shape[time_dim] - 1) for key, value in (tasks or {}).items()}
+        index = tuple(steps.values())
+        if index not in known:
+            chosen = {key: value.select(time_dim, steps[key]) for key, value in (tasks or {}).items()}
+            known[index] = prior(None if tasks is None else chosen)
+        return known[index]
 
     return at
 

@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 from torchrl_vjepa.belief import Transition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.distributions import Density, point_estimate
-from torchrl_vjepa.priors import Prior, Task
+from torchrl_vjepa.priors import LatentDensity, Prior, Task
 
 __all__ = ["NO_GRADIENT", "LatentStep"]
 
@@ -165,7 +165,13 @@ class LatentStep(TensorDictModuleBase):
         return out.set(self.latent_key, latent).set(self.reward_key, -cost.unsqueeze(-1))
 
     def stage_cost(
-        self, latent: Tensor, action: Tensor, task: Task = None, *, needs_gradient: bool = False
+        self,
+        latent: Tensor,
+        action: Tensor,
+        task: Task = None,
+        *,
+        density: LatentDensity | None = None,
+        needs_gradient: bool = False,
     ) -> Tensor:
         """Costs of next latents and the actions that led there, all at once.
 
@@ -173,6 +179,7 @@ class LatentStep(TensorDictModuleBase):
             latent: of shape ``(*B, D)``.
             action: flat, of shape ``(*B, A)``.
             task: of the prior, with batch dimensions that broadcast against ``*B``.
+            density: what the prior gives for the task, where that is known already.
             needs_gradient: whether an energy without a gradient is refused: in a sum with other costs its
                 absence would not be noticed.
 
@@ -185,9 +192,10 @@ class LatentStep(TensorDictModuleBase):
         total = self.own_cost(latent, action)
         if self.prior is None:
             return total
-        energy = _checked_shape(self.prior.energy(latent, task), latent.shape[:-1], "prior")
+        if density is None:
+            density = self.prior.density(latent.shape[-1], task)
+        energy = _checked_shape(-density.log_prob(latent), latent.shape[:-1], "prior")
         if needs_gradient and not energy.requires_grad and torch.is_grad_enabled():
-            density = self.prior(task)
             if not (isinstance(density, Density) and density.is_flat):
                 raise ValueError(NO_GRADIENT)
         return energy if total is None else total + energy
@@ -249,14 +257,16 @@ class LatentStep(TensorDictModuleBase):
         alive = torch.cat([torch.ones_like(alive[..., :1]), alive[..., :-1]], dim=-1)
         return alive * (costs + probability * self.termination_cost)
 
-    def fused_cost(self, latent: Tensor, action: Tensor, log_evidence: Tensor, task: Task = None) -> Tensor:
+    def fused_cost(
+        self, latent: Tensor, action: Tensor, log_evidence: Tensor, density: LatentDensity | None = None
+    ) -> Tensor:
         """Costs of trajectories that were drawn from the fused transition, as far as an episode lives.
 
         Args:
             latent: next latents, of shape ``(*B, H, D)``.
             action: flat, of shape ``(*B, H, A)``.
             log_evidence: of every step's fusion, of shape ``(*B, H)``.
-            task: of the prior.
+            density: what the prior gives for its tasks; needed where there is a termination model.
 
         Returns:
             Of shape ``(*B, H)``.
@@ -265,8 +275,8 @@ class LatentStep(TensorDictModuleBase):
             own = self.own_cost(latent, action)
             return -log_evidence if own is None else own - log_evidence
         # The draws have met the prior at every step; what is wanted counts it until the end alone.
-        counted = self.until_end(self.stage_cost(latent, action, task), latent, action)
-        return counted - self.prior.energy(latent, task) - log_evidence  # type: ignore[union-attr]
+        counted = self.until_end(self.stage_cost(latent, action, density=density), latent, action)
+        return counted + density.log_prob(latent) - log_evidence  # type: ignore[union-attr]
 
     def _reward(self, latent: Tensor, action: Tensor) -> Tensor:
         batch = latent.shape[:-1]

@@ -90,16 +90,30 @@ class Prior(nn.Module, abc.ABC):
         Raises:
             ValueError: if the latent has another size than the prior's.
         """
+        return self.density(latent.shape[-1] if latent.ndim else 0, task).log_prob(latent)
+
+    def density(self, latent_dim: int, task: Task = None) -> LatentDensity:
+        r"""As :meth:`forward`, refused where it is not over latents of a size.
+
+        Args:
+            latent_dim: ``D``.
+            task: :math:`\eta`.
+
+        Returns:
+            The density.
+
+        Raises:
+            ValueError: if the prior is over latents of another size.
+        """
         density = self(task)
         size = self.latent_dim
         if size is None and not isinstance(density, Density):
             size = density.event_shape[-1]
-        if latent.ndim == 0 or (size is not None and latent.shape[-1] != size):
+        if latent_dim != size and (size is not None or not latent_dim):
             raise ValueError(
-                f"latent must have last dimension {size} for this {type(self).__name__}, "
-                f"got shape {tuple(latent.shape)}"
+                f"latent must have last dimension {size} for this {type(self).__name__}, got {latent_dim}"
             )
-        return density.log_prob(latent)
+        return density
 
     def energy(self, latent: Tensor, task: Task = None) -> Tensor:
         r"""Energy :math:`E(Z; \eta) = -\log p_{\text{prior}}(Z \mid \eta)`, up to a constant.
