@@ -68,6 +68,19 @@ class EnergyWell(Well):
         return Density(lambda z: -density.log_prob(z))
 
 
+class Encoded(Well):
+    """The task is read by an encoder, which is trained and expensive."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = torch.nn.Linear(2, 2, dtype=torch.float64)
+        self.calls: list[torch.Size] = []
+        self.encoder.register_forward_hook(lambda module, inputs, out: self.calls.append(out.shape))
+
+    def forward(self, task: Task = None) -> LatentDensity:
+        return super().forward(self.encoder(self.own_task(task)))
+
+
 def make_env(prior: Prior | None = None, **kwargs: Any) -> LatentEnv:
     spec = kwargs.pop("action_spec", Bounded(-2, 2, (1,), dtype=torch.float64))
     kwargs.setdefault("dtype", torch.float64)
@@ -81,6 +94,74 @@ def state_of(env: LatentEnv, batch: tuple[int, ...] = (3,), **tasks: Tensor) -> 
 
 def plans(batch: tuple[int, ...] = (3,), num: int = 5, horizon: int = 4) -> Tensor:
     return torch.randn(*batch, num, horizon, 1, dtype=torch.float64)
+
+
+class TestWhatRoundsShare:
+    """Tasks do not change within a planning call: what the prior makes of them is made once."""
+
+    @staticmethod
+    def planners(env: LatentEnv) -> dict[str, Any]:
+        sizes = {"num_candidates": 16, "seed": 0}
+        return {
+            "energy": CEM(env, 4, 3, **sizes),
+            "chunked": CEM(env, 4, 3, chunk_size=5, **sizes),
+            "weight": MPPI(env, 4, 3, fusion="weight", num_samples=2, **sizes),
+            "propose": MPPI(env, 4, 3, fusion="propose", num_samples=2, **sizes),
+            "gradient": GradientMPC(env, 4, 3, num_starts=2, seed=0),
+            "gradient, propose": GradientMPC(env, 4, 3, fusion="propose", num_samples=2, seed=0),
+        }
+
+    @pytest.mark.parametrize("time_indexed", [False, True])
+    @pytest.mark.parametrize("name", ["energy", "chunked", "weight", "propose", "gradient", "gradient, propose"])
+    def test_the_goal_encoder_runs_once(self, name: str, time_indexed: bool) -> None:
+        prior = Encoded()
+        env = make_env(prior, how="sample" if name != "energy" else "mean")
+        planner = self.planners(env)[name]
+        shape = (3, 6, 2) if time_indexed else (3, 2)
+        goal = torch.randn(shape, dtype=torch.float64)
+        td = TensorDict(latent=torch.randn(3, 2, dtype=torch.float64), goal=goal, batch_size=3)
+        prior.calls.clear()
+        out = planner(td)
+        # Steps that are fused one by one have each their own task, where it is another.
+        assert len(prior.calls) == (4 if time_indexed and "propose" in name else 1)
+        assert out["action"].isfinite().all()
+        assert prior.encoder.weight.grad is None
+
+    @pytest.mark.parametrize("fusion", ["energy", "weight", "propose"])
+    @pytest.mark.parametrize("ends", [False, True])
+    def test_later_rounds_cost_what_a_call_of_their_own_does(self, fusion: Any, ends: bool) -> None:
+        head = torch.nn.Linear(2, 1, dtype=torch.float64)
+        ends_by = TensorDictModule(head, ["latent"], ["termination_logit"]) if ends else None
+        env = make_env(Encoded(), how="sample", num_samples=3, termination_model=ends_by)
+        state = state_of(env, goal=torch.randn(3, 6, 2, dtype=torch.float64))
+        evaluate = env.objective_from(state, fusion=fusion)
+        for horizon in (4, 4, 3):
+            actions, seed = plans(horizon=horizon), torch.Generator().manual_seed(1)
+            costs = env.objective(state, actions, fusion=fusion, generator=seed)
+            torch.testing.assert_close(evaluate(actions, torch.Generator().manual_seed(1)), costs)
+
+    def test_a_new_call_sees_new_weights_and_new_tasks(self) -> None:
+        prior = Encoded()
+        planner = CEM(make_env(prior), 4, 2, num_candidates=16, seed=0)
+        latent = torch.randn(3, 2, dtype=torch.float64)
+
+        def cost(goal: float) -> Tensor:
+            task = torch.full((3, 2), goal, dtype=torch.float64)
+            state = planner.env.planning_state(TensorDict(latent=latent, goal=task, batch_size=3))
+            return planner.env.objective(state, torch.zeros(3, 1, 4, 1, dtype=torch.float64))
+
+        first = cost(0.0)
+        assert not torch.allclose(cost(1.0), first)
+        with torch.no_grad():
+            prior.encoder.bias.add_(1.0)
+        assert not torch.allclose(cost(0.0), first)
+
+    def test_the_objective_alone_has_gradients_for_the_prior(self) -> None:
+        prior = Encoded()
+        env = make_env(prior)
+        state = state_of(env, goal=torch.randn(3, 2, dtype=torch.float64))
+        env.objective(state, plans()).sum().backward()
+        assert prior.encoder.weight.grad.abs().sum() > 0
 
 
 class TestTasks:

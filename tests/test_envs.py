@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import pickle
 from typing import Any
 
@@ -23,6 +24,7 @@ from torchrl_vjepa.encoders import linear_encoder
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.models import VJEPA
 from torchrl_vjepa.predictor import Predictor
+from torchrl_vjepa.simulation import BatchedSimulationEnv
 
 A_MATRIX = torch.tensor([[0.9, 0.2], [-0.2, 0.9]])
 B_MATRIX = torch.tensor([[1.0, 0.0], [0.5, 1.0]])
@@ -482,3 +484,17 @@ class TestTorchRLPlanners:
 def test_a_reward_network_without_keys_is_refused() -> None:
     with pytest.raises(TypeError, match="reward_model must be a TensorDictModule.*got QuadraticReward"):
         make_env(reward_model=QuadraticReward(2, 2))
+
+
+def test_editors_see_the_arguments() -> None:
+    class Other(LatentEnv):
+        def __init__(self, size: int) -> None: ...
+
+    own = inspect.signature(LatentEnv)
+    assert "self" not in own.parameters
+    assert list(own.parameters) == list(inspect.signature(LatentEnv.__init__).parameters)[1:]
+    assert own.parameters["model"].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD
+    assert own.parameters["action_spec"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert list(inspect.signature(Other).parameters) == ["size"]
+    assert "num_envs" in inspect.signature(BatchedSimulationEnv).parameters
+    assert not hasattr(make_env(cost=quadratic_cost(torch.ones(2))), "__signature__")

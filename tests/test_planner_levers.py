@@ -56,6 +56,17 @@ def by_steps(predictor: Predictor, latent: Tensor, actions: Tensor) -> Tensor:
     return torch.stack(out, dim=-2)
 
 
+class _Rolled(nn.Module):
+    """A rollout as a module, whose weights can be given."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        super().__init__()
+        self.predictor = predictor
+
+    def forward(self, latent: Tensor, actions: Tensor) -> Tensor:
+        return rollout(self.predictor.dist, latent, actions)
+
+
 def make_env(how: Any = "mean", **kwargs: Any) -> LatentEnv:
     torch.manual_seed(1)
     predictor = Predictor(4, action_dim=2, trunk="mlp", num_cells=(32, 32), residual=True)
@@ -154,6 +165,50 @@ class TestPointRollout:
             torch.testing.assert_close(
                 rollout(predictor.dist, latent, actions), by_steps(predictor, latent, actions)
             )
+
+    def test_what_hooks_keep_is_not_overwritten(self) -> None:
+        predictor = Predictor(3, 2, trunk="mlp", num_cells=(8,))
+        seen: list[Tensor] = []
+        predictor.trunks[0][1].register_forward_hook(lambda module, inputs, out: seen.append(out))
+        latent, actions = torch.randn(5, 3), torch.randn(5, 4, 2)
+        with torch.no_grad():
+            rollout(predictor.dist, latent, actions)
+            kept, seen[:] = list(seen), []
+            by_steps(predictor, latent, actions)
+        for ours, expected in zip(kept, seen, strict=True):
+            torch.testing.assert_close(ours, expected)
+
+    def test_steps_share_memory_only_where_nobody_follows_them(self) -> None:
+        predictor = Predictor(3, 2, trunk="mlp", num_cells=(8,), residual=True)
+        latent, actions = torch.randn(6, 5, 3), torch.randn(6, 5, 4, 2)
+        expected = by_steps(predictor, latent, actions)
+        with torch.no_grad():
+            mapped = torch.func.vmap(lambda z, u: rollout(predictor.dist, z, u))(latent, actions)
+            torch.testing.assert_close(mapped, expected)
+            moved = {
+                name: torch.stack([value, 2 * value]) for name, value in predictor.named_parameters()
+            }
+            by_weights = torch.func.vmap(
+                lambda weights: torch.func.functional_call(
+                    _Rolled(predictor), {f"predictor.{k}": v for k, v in weights.items()}, (latent, actions)
+                )
+            )(moved)
+            torch.testing.assert_close(by_weights[0], expected)
+            with torch.autocast("cpu", torch.bfloat16):
+                rounded = rollout(predictor.dist, latent, actions)
+        torch.testing.assert_close(rounded.float(), expected, atol=0.1, rtol=0.1)
+
+    @pytest.mark.parametrize("first", [torch.bfloat16, torch.float32])
+    def test_inputs_of_two_dtypes_compute_in_that_of_the_weights(self, first: torch.dtype) -> None:
+        predictor = Predictor(3, 2, trunk="mlp", num_cells=(8,))
+        latent, actions = torch.randn(5, 3).to(first), torch.randn(5, 4, 2)
+        actions = actions.to(torch.bfloat16 if first == torch.float32 else torch.float32)
+        out = []
+        for grad in (False, True):
+            with torch.set_grad_enabled(grad):
+                out.append(rollout(predictor.dist, latent, actions))
+        assert out[0].dtype == out[1].dtype == torch.float32
+        torch.testing.assert_close(out[0], out[1], atol=1e-5, rtol=1e-5)
 
     def test_the_network_is_left_alone(self) -> None:
         predictor = Predictor(3, 2, trunk="mlp", num_cells=(8,))

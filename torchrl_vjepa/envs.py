@@ -8,7 +8,7 @@ better. :class:`LatentEnv` answers both on plain tensors.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -22,29 +22,23 @@ from torchrl_vjepa.belief import PreparedTransition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.imagination import (
+    PlanPrior,
     Tasks,
     check_prior,
-    densities,
     first_latents,
     imagine,
     imagine_fused,
     read_state,
 )
 from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
-from torchrl_vjepa.priors import LatentDensity, Prior
+from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
+from torchrl_vjepa.signatures import InitSignature
 
 __all__ = ["LatentEnv"]
 
 #: Trajectories per plan where a belief is given and no number: one particle would be a matter of luck.
 BELIEF_SAMPLES = 64
-
-
-class _PlanPrior(NamedTuple):
-    """What a prior gives along plans of one horizon: for all steps at once, and for each; where needed."""
-
-    whole: LatentDensity | None
-    at: Callable[[int], LatentDensity] | None
 
 
 class LatentEnv(ModelBasedEnvBase):
@@ -142,6 +136,8 @@ class LatentEnv(ModelBasedEnvBase):
         >>> env.objective(torch.zeros(2), plans)
         tensor([0., 2.])
     """
+
+    __signature__ = InitSignature()
 
     def __init__(
         self,
@@ -364,13 +360,18 @@ class LatentEnv(ModelBasedEnvBase):
             raise ValueError(f"rollout_dtype must be None for fusion='propose', got {self.rollout_dtype}")
         world_model = self.world_model
         transition = PreparedTransition(world_model.transition, self.rollout_dtype)
-        prior_of: dict[int, _PlanPrior] = {}  # by horizon
+        prior_of: dict[int, PlanPrior] = {}  # by horizon
 
         def evaluate(actions: Tensor, generator: torch.Generator | None = None) -> Tensor:
             start, actions = self._start(state, actions, given.num_samples, generator)
             prior = prior_of.get(actions.shape[-2])
             if prior is None:
-                prior = prior_of[actions.shape[-2]] = self._plan_prior(state, actions, given.fusion)
+                tasks, by_step = self._tasks(state, actions), given.fusion == "propose"
+                prior = PlanPrior.of(
+                    world_model.prior, tasks, self.latent_dim, actions.ndim - 3 if by_step else None,
+                    whole=not by_step or world_model.termination_model is not None,
+                )  # fmt: skip
+                prior_of[actions.shape[-2]] = prior
             if prior.at is not None:
                 latents, evidence = imagine_fused(
                     transition, start, actions, prior.at, generator, self.num_particles
@@ -439,16 +440,6 @@ class LatentEnv(ModelBasedEnvBase):
         """How the next latent is chosen: what starts from a belief may be sampled at its start alone."""
         from_belief = self.belief_key is not None and not isinstance(state, Tensor)
         return self.how if settings.num_samples is None or from_belief else "sample"
-
-    def _plan_prior(self, state: Tensor | TensorDictBase, actions: Tensor, fusion: str) -> _PlanPrior:
-        prior, proposes = self.world_model.prior, fusion == "propose"
-        if prior is None:
-            return _PlanPrior(None, None)
-        tasks = self._tasks(state, actions)
-        at = densities(prior, tasks, actions.ndim - 3) if proposes else None
-        if proposes and self.world_model.termination_model is None:
-            return _PlanPrior(None, at)
-        return _PlanPrior(prior.density(self.latent_dim, tasks), at)
 
     def _tasks(self, state: Tensor | TensorDictBase, actions: Tensor) -> Tasks | None:
         """Tasks of every step, ``(*B, 1, H or 1, *task)``: they broadcast against ``(M, *B, N, H)``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -15,6 +15,7 @@ from torchrl_vjepa.fusion import fuse
 from torchrl_vjepa.priors import LatentDensity, Prior
 
 __all__ = [
+    "PlanPrior",
     "Tasks",
     "check_prior",
     "densities",
@@ -84,6 +85,55 @@ def densities(prior: Prior, tasks: Tasks | None, time_dim: int) -> Callable[[int
         return known[index]
 
     return at
+
+
+class PlanPrior(NamedTuple):
+    """What a prior gives along plans, once for all rounds of a planning call.
+
+    Attributes:
+        whole: the density of all steps at once, where it is needed.
+        at: the density of each step, where it is needed.
+
+    Examples:
+        >>> from torchrl_vjepa import GaussianPrior
+        >>> PlanPrior.of(GaussianPrior(2), None, 2).at is None
+        True
+    """
+
+    whole: LatentDensity | None
+    at: Callable[[int], LatentDensity] | None
+
+    @classmethod
+    def of(
+        cls,
+        prior: Prior | None,
+        tasks: Tasks | None,
+        latent_dim: int,
+        time_dim: int | None = None,
+        *,
+        whole: bool = True,
+    ) -> PlanPrior:
+        """From the prior and its tasks.
+
+        Args:
+            prior: the prior, if there is one.
+            tasks: what it reads, with a dimension of time; ``None`` if it reads nothing.
+            latent_dim: ``D``.
+            time_dim: which dimension that is, where each step is asked for.
+            whole: whether all steps at once are asked for.
+
+        Returns:
+            What is asked for.
+
+        Examples:
+            >>> from torchrl_vjepa import GaussianPrior
+            >>> PlanPrior.of(GaussianPrior(2), None, 2).whole.event_shape
+            torch.Size([2])
+        """
+        if prior is None:
+            return cls(None, None)
+        at = None if time_dim is None else densities(prior, tasks, time_dim)
+        return cls(prior.density(latent_dim, tasks) if whole else None, at)
 
 
 def drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator | None) -> Tensor:

@@ -18,6 +18,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_vjepa.signatures import InitSignature
+
 __all__ = [
     "BatchedSimulationEnv",
     "Simulation",
@@ -276,6 +278,8 @@ class BatchedSimulationEnv(EnvBase):
         >>> issubclass(BatchedForkEnv, BatchedSimulationEnv)
         True
     """
+
+    __signature__ = InitSignature()
 
     def __init__(
         self,
