@@ -162,7 +162,7 @@ class TestProposals:
     def test_draws_are_exact_codes_inside_the_specification(self, name: str) -> None:
         codec = ActionCodec(EVERY[name])
         family = ProposalFamily(codec, 1.0 if name == "unbounded" else None)
-        proposal = family.confine(Proposal(*(x.clone() for x in family.cold((2,), 3))), 0.01)
+        proposal = family.confinement(0.01)(Proposal(*(x.clone() for x in family.cold((2,), 3))))
         torch.testing.assert_close(tuple(proposal), tuple(family.cold((2,), 3)))
         generator = torch.Generator().manual_seed(0)
         noise = 3 * torch.randn(50, 3, family.noise_dim, generator=generator, dtype=codec.dtype)
@@ -176,7 +176,7 @@ class TestProposals:
         codec = ActionCodec(spec)
         family = ProposalFamily(codec)
         mean = torch.tensor([[0.2, 0.5, 0.0, 0.3, 0.1, 0.8]])
-        proposal = family.confine(Proposal(mean, mean), 1e-3)
+        proposal = family.confinement(1e-3)(Proposal(mean, mean))
         torch.testing.assert_close(proposal.mean, mean, atol=1e-3, rtol=0)
         torch.testing.assert_close(proposal.std, (mean * (1 - mean)).sqrt(), atol=2e-3, rtol=0)
         num = 40_000
@@ -200,13 +200,13 @@ class TestProposals:
         family = ProposalFamily(ActionCodec(Composite(a=Categorical(4), b=Binary(4))))
         family.double()
         mean = torch.tensor([weights * 2], dtype=torch.float64)
-        once = family.confine(Proposal(mean, mean), floor)
+        once = family.confinement(floor)(Proposal(mean, mean))
         choices, bits = once.mean[0, :4], once.mean[0, 4:]
         torch.testing.assert_close(choices.sum(), torch.ones((), dtype=torch.float64))
         assert (choices >= floor / 4 - 1e-12).all()
         assert (bits >= floor / 2).all()
         assert (bits <= 1 - floor / 2).all()
-        twice = family.confine(once, floor)
+        twice = family.confinement(floor)(once)
         torch.testing.assert_close(twice.mean, once.mean)
 
     def test_a_warm_start_mixes_the_plan_with_the_uniform(self) -> None:

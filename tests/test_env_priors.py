@@ -112,7 +112,9 @@ class TestWhatRoundsShare:
         }
 
     @pytest.mark.parametrize("time_indexed", [False, True])
-    @pytest.mark.parametrize("name", ["energy", "chunked", "weight", "propose", "gradient", "gradient, propose"])
+    @pytest.mark.parametrize(
+        "name", ["energy", "chunked", "weight", "propose", "gradient", "gradient, propose"]
+    )
     def test_the_goal_encoder_runs_once(self, name: str, time_indexed: bool) -> None:
         prior = Encoded()
         env = make_env(prior, how="sample" if name != "energy" else "mean")

@@ -185,9 +185,7 @@ class TestPointRollout:
         with torch.no_grad():
             mapped = torch.func.vmap(lambda z, u: rollout(predictor.dist, z, u))(latent, actions)
             torch.testing.assert_close(mapped, expected)
-            moved = {
-                name: torch.stack([value, 2 * value]) for name, value in predictor.named_parameters()
-            }
+            moved = {name: torch.stack([value, 2 * value]) for name, value in predictor.named_parameters()}
             by_weights = torch.func.vmap(
                 lambda weights: torch.func.functional_call(
                     _Rolled(predictor), {f"predictor.{k}": v for k, v in weights.items()}, (latent, actions)

@@ -126,7 +126,8 @@ def _weighted_squares(squares: Tensor, weight: Tensor) -> Tensor:
     number = weight.ndim == 0  # which takes the dtype of what it multiplies
     if size <= 16 and (number or weight.dtype == squares.dtype):
         # torch sums short rows several times more slowly than it multiplies them.
-        return squares @ weight.to(squares.dtype).expand(size)
+        weight = weight.to(squares.dtype).expand(size)
+        return squares.reshape(-1, size).mv(weight).view(squares.shape[:-1])
     if number:
         return weight * squares.sum(dim=-1)
     return (squares * weight).sum(dim=-1)

@@ -195,9 +195,9 @@ class LatentStep(TensorDictModuleBase):
         if density is None:
             density = self.prior.density(latent.shape[-1], task)
         energy = _checked_shape(-density.log_prob(latent), latent.shape[:-1], "prior")
-        if needs_gradient and not energy.requires_grad and torch.is_grad_enabled():
-            if not (isinstance(density, Density) and density.is_flat):
-                raise ValueError(NO_GRADIENT)
+        lacks_gradient = needs_gradient and not energy.requires_grad and torch.is_grad_enabled()
+        if lacks_gradient and not (isinstance(density, Density) and density.is_flat):
+            raise ValueError(NO_GRADIENT)
         return energy if total is None else total + energy
 
     def own_cost(self, latent: Tensor, action: Tensor) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -87,20 +88,23 @@ def warn_of_costs(best_cost: Tensor, constrained: bool) -> None:
     """One warning where a row has no plan of finite cost, or none that satisfies the constraints.
 
     Args:
-        best_cost: of shape ``(*B)``.
+        best_cost: of shape ``(*B)``; not minus infinity.
         constrained: whether there are constraints.
 
     Examples:
         >>> warn_of_costs(torch.zeros(3), True)
     """
-    if not bool(best_cost.isfinite().all()):
+    if not best_cost.numel():
+        return
+    worst = float(best_cost.max())  # nan where there is one
+    if not math.isfinite(worst):
         warnings.warn(
             "no candidate plan has a finite cost in at least one row: its action is the mean "
             "of the proposal; check the model, the cost and the input for nan and inf",
             RuntimeWarning,
             stacklevel=5,
         )
-    elif constrained and bool((best_cost >= REJECTED_COST).any()):
+    elif constrained and worst >= REJECTED_COST:
         warnings.warn(
             "no candidate plan satisfies the chance constraints in at least one row: its plan is the "
             "one of least violation; widen the search, or loosen delta",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -135,26 +136,32 @@ class ProposalFamily(nn.Module):
         mixed = (1 - spread) * self._normalised(mean) + spread * self.centre
         return self._discrete(torch.where(self.codec.is_choice | self.codec.is_bit, mixed, mean), std)
 
-    def confine(self, proposal: Proposal, floor: float) -> Proposal:
+    def confinement(self, floor: float) -> Callable[[Proposal], Proposal]:
         """The nearest proposal inside the bounds, of a spread between a floor and that of a cold start.
 
         Args:
-            proposal: finite, of shape ``(*B, H, A)``.
             floor: of numbers, as a fraction of the cold spread; and the weight of the uniform distribution
                 that the one over choices contains at least, so that none is ever ruled out.
 
         Returns:
-            The proposal; one that is inside already stays as it is.
+            Takes a finite proposal of shape ``(*B, H, A)`` to the nearest; one that is inside already stays
+            as it is.
         """
-        mean = proposal.mean.clamp(self.low, self.high)
-        std = proposal.std.clamp(floor * self.cold_std, self.cold_std)
-        codec = self.codec
-        if codec.is_continuous:
-            return Proposal(mean, std)
-        excess = (self._normalised(mean) - floor * self.centre).clamp_min(0)
-        choice = floor * self.centre + (1 - floor) * self._normalised(excess)
-        mean = torch.where(codec.is_choice, choice, mean)
-        return self._discrete(torch.where(codec.is_bit, mean.clamp(0.5 * floor, 1 - 0.5 * floor), mean), std)
+        codec, low, high, cold_std = self.codec, self.low, self.high, self.cold_std
+        least_std = floor * cold_std
+
+        def confine(proposal: Proposal) -> Proposal:
+            mean = proposal.mean.clamp(low, high)
+            std = proposal.std.clamp(least_std, cold_std)
+            if codec.is_continuous:
+                return Proposal(mean, std)
+            excess = (self._normalised(mean) - floor * self.centre).clamp_min(0)
+            choice = floor * self.centre + (1 - floor) * self._normalised(excess)
+            mean = torch.where(codec.is_choice, choice, mean)
+            mean = torch.where(codec.is_bit, mean.clamp(0.5 * floor, 1 - 0.5 * floor), mean)
+            return self._discrete(mean, std)
+
+        return confine
 
     def draw(self, proposal: Proposal, noise: Tensor) -> Tensor:
         """Plans, as exact codes inside the bounds.

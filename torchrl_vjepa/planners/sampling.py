@@ -164,7 +164,7 @@ class SamplingPlanner(Planner):
         Returns:
             The plan. No value leaves the device.
         """
-        codec, family = self.codec, self.family
+        codec, confine = self.codec, self.family.confinement(self.min_std)
         best = codec.mode(proposal.mean)
         # Costs keep the dimensions of a plan, (*B, 1, 1): they choose between plans.
         best_cost = infinite = best.new_full((*best.shape[:-2], 1, 1), math.inf)
@@ -192,7 +192,7 @@ class SamplingPlanner(Planner):
             found = lowest < infinite
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
-            proposal = family.confine(Proposal(mean, std), self.min_std)
+            proposal = confine(Proposal(mean, std))
             if clock is not None and not clock.another(best_cost):
                 break
         best_cost = best_cost[..., 0, 0]
