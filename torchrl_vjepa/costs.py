@@ -169,9 +169,10 @@ class _QuadraticCost(Cost):
         self.register_buffer("weight", weight)
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
-        if self.weight.ndim == 2:
-            return _quadratic_form(latent - self.target, self.weight)
-        return _weighted_squares((latent - self.target).square_(), self.weight)
+        error, weight = latent - self.target, self.weight
+        if weight.ndim == 2:
+            return _quadratic_form(error, weight)
+        return _weighted_squares(error.square_(), weight)
 
 
 class _ActionCost(Cost):

@@ -214,8 +214,9 @@ class LatentStep(TensorDictModuleBase):
             ValueError: if the cost or the reward model returns another shape.
         """
         total = None
-        if self.cost is not None:
-            total = _checked_shape(self.cost(latent, action), latent.shape[:-1], "cost")
+        cost = self.cost
+        if cost is not None:
+            total = _checked_shape(cost(latent, action), latent.shape[:-1], "cost")
         if self.reward_model is None:
             return total
         reward = self._reward(latent, action)
