@@ -129,8 +129,8 @@ def _roll(
         if move is not None:
             horizon, size = actions.shape[-2], latent.shape[-1]
             rows = latent.reshape(-1, size)
-            latents = move(rows, actions.reshape(len(rows), horizon, actions.shape[-1]))
-            return latents.view(*latent.shape[:-1], horizon, size)
+            moved = move(rows, actions.reshape(len(rows), horizon, actions.shape[-1]))
+            return moved.view(*latent.shape[:-1], horizon, size)
     latents = []
     for action in actions.unbind(-2):
         latent = point_estimate(transition(latent, action), how, generator=generator)
