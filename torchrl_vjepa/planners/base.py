@@ -20,12 +20,14 @@ from torchrl_vjepa.generators import offspring, pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
 from torchrl_vjepa.planners.plan import Plan, check_counts, remembered, warn_of_costs
 from torchrl_vjepa.planners.proposal import Proposal, ProposalFamily
+from torchrl_vjepa.planners.source import admit_head, checked_sampling, probe_value
 from torchrl_vjepa.risk import ChanceConstraint, Risk
+from torchrl_vjepa.state_heads import Head
 
 __all__ = ["Planner"]
 
 _STATISTICS = ("actions", "std", "cost", "violation")
-_SAMPLING = ("num_samples", "risk", "constraints", "fusion")
+_SAMPLING = ("num_samples", "risk", "constraints", "fusion", "terminal_value")
 _GENERATORS = ("_generator", "_model_generator")
 
 
@@ -92,6 +94,12 @@ class Planner(MPCPlannerBase):
         fusion: how the environment's prior enters the cost of a plan: as an ``"energy"``, or by posterior
             (``"weight"``, ``"propose"``; see :class:`~torchrl_vjepa.envs.LatentEnv`); the environment's by
             default.
+        terminal_value: what a plan is worth behind its horizon, :math:`J = \sum_k c_k - a_H V(Z_{t+H})` with
+            the probability :math:`a_H` that the episode has not ended: latents ``(*B, D)`` to values
+            ``(*B)``, expected sums of rewards (minus costs), higher is better; or a TensorDictModule that
+            reads the latent (of an environment that is stepped: entries of its state) and writes
+            ``state_value``, ``(*B, 1)``, as :class:`~torchrl.modules.ValueOperator`. Each sampled trajectory
+            has its own. It is part of ``("plan_stats", "cost")``.
         compile: call the objective through ``torch.compile``, with these options (``{"mode":
             "reduce-overhead"}`` are CUDA graphs on a GPU). The first call, and the first of each new batch
             size, takes long.
@@ -156,6 +164,7 @@ class Planner(MPCPlannerBase):
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: Literal["energy", "weight", "propose"] | None = None,
+        terminal_value: Head | None = None,
         compile: bool | Mapping[str, Any] = False,
         return_stats: bool | Mapping[str, Risk] = False,
         plan_key: NestedKey = "plan",
@@ -189,7 +198,12 @@ class Planner(MPCPlannerBase):
         offers_objective = callable(getattr(type(env), "objective", None))
         self._env_objective = None if offers_objective else EnvObjective(env)
         asked = {"num_samples": num_samples, "risk": risk, "constraints": constraints, "fusion": fusion}
+        asked["terminal_value"] = terminal_value
         self._constrained = self._checked_sampling(_given(asked))
+        if terminal_value is not None:
+            admit_head(self._source, env, "terminal_value", terminal_value, ["state_value"])
+            probe_value(self._source, "terminal_value", terminal_value)
+        self.terminal_value: Any = terminal_value
         self.num_samples, self.risk, self.fusion = num_samples, risk, fusion
         self.constraints = None if constraints is None else nn.ModuleList(constraints)
         self.planning_horizon, self.optim_steps = planning_horizon, optim_steps
@@ -405,15 +419,8 @@ class Planner(MPCPlannerBase):
 
     def _checked_sampling(self, asked: dict[str, Any]) -> bool:
         """Refuse early what the environment cannot evaluate; true if there are constraints."""
-        source = self._source
-        if callable(getattr(type(source), "sampling", None)):
-            return bool(source.sampling(**asked).constraints)
-        if asked:
-            raise TypeError(
-                f"{' and '.join(asked)} need an environment whose objective takes them, as LatentEnv "
-                f"does, got {type(self.env).__name__}, whose own objective has no method sampling beside it"
-            )
-        return False
+        settings = checked_sampling(self._source, self.env, asked)
+        return settings is not None and bool(settings.constraints)
 
     def _statistics(self, state: Any, plan: Tensor) -> list[Tensor]:
         """Cost and, if there are constraints, probabilities of violation, from the same noise."""

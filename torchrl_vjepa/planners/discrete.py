@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.base import Planner
-from torchrl_vjepa.planners.expansion import EnvExpansion, Expansion, LatentExpansion
+from torchrl_vjepa.planners.expansion import Expansion, expansion_from
 from torchrl_vjepa.planners.proposal import Proposal
 
 __all__ = ["DiscretePlanner", "joint_choices"]
@@ -140,6 +140,4 @@ class DiscretePlanner(Planner):
 
     def _expansion(self, state: Any) -> Expansion:
         """Steps of the environment from a state of planning."""
-        if self._env_objective is not None:
-            return EnvExpansion(self._env_objective, state)
-        return LatentExpansion(self.env, state, self.planning_horizon)
+        return expansion_from(self._source, state, self.planning_horizon)

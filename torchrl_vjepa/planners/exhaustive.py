@@ -9,9 +9,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.planners.discrete import DiscretePlanner
-from torchrl_vjepa.planners.expansion import Expansion, State
+from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.source import latent_key_of
+from torchrl_vjepa.state_heads import state_value
 
 __all__ = ["ExhaustiveSearch"]
 
@@ -19,8 +21,9 @@ __all__ = ["ExhaustiveSearch"]
 class ExhaustiveSearch(DiscretePlanner):
     r"""The best of all :math:`n^H` plans, exactly.
 
-    .. math:: u^\star = \arg\min_{u \in \{1, \dots, n\}^H} \sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k})
+    .. math:: u^\star = \arg\min_{u \in \{1, \dots, n\}^H} \sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k}) - V(Z_{t+H})
 
+    with the ``terminal_value`` :math:`V`, if there is one.
     Of equal plans it is the first in lexical order. Where a plan costs the sum of what its steps cost (the
     point prediction of a :class:`~torchrl_vjepa.envs.LatentEnv`, or an environment that is stepped) the tree
     of plans is expanded breadth first: what plans have in common is imagined once,
@@ -120,6 +123,11 @@ class ExhaustiveSearch(DiscretePlanner):
         """Lowest cost ``(R)`` of plans that begin as ``W`` states ``(R, W)`` did, and its number."""
         rows, width = cost.shape
         if step == self.planning_horizon:
+            if self.terminal_value is not None:
+                value = state_value(
+                    self.terminal_value, entries(state), cost.shape, latent_key_of(self._source)
+                )
+                cost = cost - state[ALIVE] * value.to(cost.dtype)
             return torch.where(cost.isfinite(), cost, torch.inf).min(dim=1)
         n = self.num_actions
         size = width if self.chunk_size is None else max(1, self.chunk_size // n)

@@ -9,13 +9,16 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.expansion import expansion_from
 from torchrl_vjepa.planners.noise import coloured_noise_factor
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.suggestions import policy_candidates, suggested_plans
 from torchrl_vjepa.risk import REJECTED_COST
 
 __all__ = ["SamplingPlanner"]
@@ -41,6 +44,11 @@ class SamplingPlanner(Planner):
     search heads for the least violation and a warning is given. The mean of feasible plans need not be
     feasible: ``output="best"`` returns a plan that was checked.
 
+    **A policy** suggests the last ``num_policy_candidates`` plans of every round: what it does in the model,
+    by point prediction (:func:`~torchrl_vjepa.planners.suggestions.suggested_plans`). So a learned policy is
+    a start that planning improves, together with a ``terminal_value`` as in TD-MPC2, and one of no use costs
+    its share of the candidates, no more.
+
     Args:
         env: see :class:`Planner`.
         planning_horizon: see :class:`Planner`.
@@ -62,10 +70,22 @@ class SamplingPlanner(Planner):
             power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
             (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
         keep_elites: fraction of the elites that are candidates again in the next round.
+        policy: a TorchRL actor (or a ``TensorDictSequential`` with one at its end) that reads the latent (of
+            an environment that is stepped: entries of its state) and writes the environment's action. Actions
+            outside the bounds are put inside, those that are not finite replaced by the proposal's mean. Its
+            draws are common to all rows: its distribution must be one that
+            :func:`~torchrl_vjepa.common_random_numbers.sample_common` has a rule for. ``None``: no
+            suggestions.
+        num_policy_candidates: how many of the ``num_candidates`` are the policy's: the first by its
+            deterministic action (``ExplorationType.DETERMINISTIC``), the others drawn from its distribution.
+            By default a twentieth of ``num_candidates``, or 1 for a policy that is deterministic.
         **kwargs: see :class:`Planner`.
 
     Raises:
-        ValueError: if an argument is out of its range; else see :class:`Planner`.
+        ValueError: if an argument is out of its range, or a policy writes a wrong shape; else see
+            :class:`Planner`.
+        TypeError: if a policy has no distribution that can be drawn so; else see :class:`Planner`.
+        KeyError: if a policy reads or writes other entries.
 
     Examples:
         A planner of one's own is one method:
@@ -110,6 +130,8 @@ class SamplingPlanner(Planner):
         output: Literal["mean", "best"] = "mean",
         noise_beta: float = 0.0,
         keep_elites: float = 0.0,
+        policy: TensorDictModuleBase | None = None,
+        num_policy_candidates: int | None = None,
         **kwargs: Any,
     ) -> None:
         check_counts(num_candidates=num_candidates)
@@ -129,13 +151,29 @@ class SamplingPlanner(Planner):
             raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
         if not 0 <= keep_elites <= 1:
             raise ValueError(f"keep_elites must be in [0, 1], got {keep_elites}")
+        if num_policy_candidates is not None:
+            check_counts(num_policy_candidates=num_policy_candidates)
+            if policy is None:
+                raise ValueError(
+                    f"num_policy_candidates must be None without a policy, got {num_policy_candidates}"
+                )
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        self.policy: Any = policy
+        self.num_policy_candidates = 0
+        if policy is not None:
+            source = self._source
+            self.num_policy_candidates = policy_candidates(
+                source, env, self.codec, policy, num_policy_candidates, num_candidates
+            )
+            read = [] if self._env_objective is None else self._env_objective.in_keys
+            self.in_keys = list(dict.fromkeys([*self.in_keys, *read]))
         self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
         self.noise_beta, self.keep_elites = noise_beta, keep_elites
         # The best plan is a candidate again anyway, so it is the next ones that are kept.
-        self._num_kept = min(int(keep_elites * top_k), top_k - 1, max(0, num_candidates - 2))
+        free = max(0, num_candidates - self.num_policy_candidates - 2)
+        self._num_kept = min(int(keep_elites * top_k), top_k - 1, free)
         colour = coloured_noise_factor(planning_horizon, noise_beta) if noise_beta else None
         self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
@@ -170,12 +208,15 @@ class SamplingPlanner(Planner):
         generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
+        suggested = self._suggested(state, proposal)
         clock = None if self.max_ms is None else _Clock(self.max_ms)
         kept = None
         for _ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
             generator.set_state(model_state)
             candidates = self._candidates(proposal, best, kept)
+            if suggested is not None:
+                candidates = torch.cat([candidates, suggested], dim=-3)
             costs = evaluate(candidates)
             elite_costs, index = costs.topk(top_k, dim=-1, largest=False)
             if constrained:
@@ -220,10 +261,20 @@ class SamplingPlanner(Planner):
 
         return in_chunks
 
+    def _suggested(self, state: Any, proposal: Proposal) -> Tensor | None:
+        """Plans ``(*B, n, H, A)`` of the policy, if there is one."""
+        if self.policy is None:
+            return None
+        mean, num = proposal.mean, self.num_policy_candidates
+        if not mean.numel():
+            return mean.unsqueeze(-3).expand(*mean.shape[:-2], num, *mean.shape[-2:])
+        expansion = expansion_from(self._source, state, self.planning_horizon)
+        return suggested_plans(expansion, self.policy, self.codec, mean, num, self._generator)
+
     def _candidates(self, proposal: Proposal, best: Tensor, kept: Tensor | None = None) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
         mean = proposal.mean
-        num = self.num_candidates
+        num = self.num_candidates - self.num_policy_candidates
         drawn = (num + 1) // 2 if self.antithetic else num
         noise = torch.randn(
             (drawn, mean.shape[-2], self.family.noise_dim),
