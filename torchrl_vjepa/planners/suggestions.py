@@ -55,6 +55,7 @@ def suggested_plans(
         ValueError: if an action has a wrong shape.
 
     Examples:
+        >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.data import Bounded
         >>> from torchrl_vjepa.costs import quadratic_cost
         >>> from torchrl_vjepa.distributions import Delta
@@ -148,6 +149,7 @@ def action_distribution(policy: TensorDictModuleBase, tensordict: TensorDictBase
         The distribution; ``None`` of a policy without one.
 
     Examples:
+        >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.modules import Actor
         >>> front = TensorDictModule(nn.Identity(), ["latent"], ["features"])
         >>> policy = TensorDictSequential(front, Actor(nn.Linear(2, 1), in_keys=["features"]))
@@ -190,6 +192,7 @@ def policy_candidates(
             shape, or what should be deterministic is not.
 
     Examples:
+        >>> from tensordict.nn import TensorDictModule
         >>> from torchrl.envs import PendulumEnv
         >>> from torchrl.modules import Actor
         >>> from torchrl_vjepa.planners import EnvObjective
