@@ -24,7 +24,7 @@ def check_head(
     env: str,
     has_latent: bool,
     writes: Sequence[NestedKey] = (),
-) -> None:
+) -> list[NestedKey]:
     """Refuse a head that states of an environment cannot be given to.
 
     Args:
@@ -35,12 +35,18 @@ def check_head(
         has_latent: whether its states are latents, so that a function of them can be called.
         writes: entries that a TensorDictModule must write.
 
+    Returns:
+        Entries of a state that a TensorDictModule reads; none of a function.
+
     Raises:
         TypeError: if the head cannot be called, or is a function of latents where there are none.
         KeyError: if a TensorDictModule reads other entries, or does not write what it must.
 
     Examples:
-        >>> check_head("terminal_value", lambda latent: latent.sum(-1), ["latent"], env="E", has_latent=True)
+        >>> from torchrl.modules import ValueOperator
+        >>> value = ValueOperator(nn.Linear(2, 1), in_keys=["latent"])
+        >>> check_head("terminal_value", value, ["latent"], env="LatentEnv", has_latent=True)
+        ['latent']
     """
     if not callable(head):
         raise TypeError(f"{name} must be callable, latents to a tensor, got {type(head).__name__}")
@@ -49,16 +55,23 @@ def check_head(
             raise TypeError(
                 f"{name} must be a TensorDictModule for {env}, which has no latent, got {type(head).__name__}"
             )
-        return
-    reads = [unravel_key(key) for key in head.in_keys]
+        return []
+    written = [unravel_key(key) for key in head.out_keys]
+    # TorchRL's composite actors also list the group of parameters that they have just written.
+    own = {path[:length] for path in map(_path, written) for length in range(1, len(path))}
+    reads = [key for key in map(unravel_key, head.in_keys) if _path(key) not in own]
     if not set(reads) <= set(readable):
         raise KeyError(
             f"{name} must read only {list(readable)} of {env}, got in_keys={reads}; rename its in_keys"
         )
-    written = [unravel_key(key) for key in head.out_keys]
     missing = [key for key in writes if key not in written]
     if missing:
         raise KeyError(f"{name} must write {missing}, got out_keys={written}")
+    return reads
+
+
+def _path(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else tuple(key)
 
 
 def call_head(

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.envs import LatentEnv
@@ -112,10 +111,8 @@ def admit_head(
         )
     readable = source.head_keys if latent_key is None else [latent_key]
     has_latent = latent_key is not None
-    check_head(name, head, readable, env=type(env).__name__, has_latent=has_latent, writes=writes)
-    if not isinstance(source, EnvObjective) or not isinstance(head, TensorDictModuleBase):
-        return []
-    return source.keep(head.in_keys)
+    reads = check_head(name, head, readable, env=type(env).__name__, has_latent=has_latent, writes=writes)
+    return source.keep(reads) if isinstance(source, EnvObjective) else []
 
 
 def example_state(source: Any, batch: tuple[int, ...]) -> State | None:

@@ -81,8 +81,8 @@ def suggested_plans(
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for step in range(horizon):
             code = _acted(policy, codec, state, (num, fallback.shape[0]), generator).to(mean)
-            code = torch.where(code.isfinite(), code, fallback[:, step]).clamp(low, high)
-            plan.append(codec.mode(code))
+            code = codec.mode(torch.where(code.isfinite(), code, fallback[:, step]))
+            plan.append(code.clamp(low, high))
             if step + 1 < horizon:
                 state = expansion.move(state, plan[-1])
     return torch.stack(plan, dim=-2).reshape(num, *batch, horizon, size).movedim(0, -3)
