@@ -99,7 +99,7 @@ def call_head(
     """
     if isinstance(head, TensorDictModuleBase):
         return head(TensorDict(dict(state), batch_size=torch.Size(batch))).get(written)
-    return head(state[latent_key])  # type: ignore[index]
+    return head(state[latent_key])
 
 
 def state_value(

@@ -100,9 +100,12 @@ class LatentExpansion:
 
     def __init__(self, env: LatentEnv, state: Tensor | TensorDictBase, horizon: int) -> None:
         self.env = env
-        latent = state if isinstance(state, Tensor) else state.get("latent", None)
-        if latent is None:
-            latent = ParticleBelief(state["particles"], state["log_weights"]).mean
+        if isinstance(state, Tensor):
+            latent = state
+        elif state.get("latent", None) is not None:
+            latent = state.get("latent")
+        else:
+            latent = ParticleBelief(state.get("particles"), state.get("log_weights")).mean
         batch = latent.shape[:-1]
         latent = latent.reshape(-1, latent.shape[-1])
         self.root: State = {env.latent_key: latent, ALIVE: torch.ones_like(latent[:, 0])}
