@@ -116,8 +116,9 @@ class Planner(MPCPlannerBase):
     Raises:
         ValueError: if an argument is out of its range, the bounds of an action are degenerate, or a risk
             or constraint has no samples to read.
-        TypeError: if an action is of a kind that has no code, or the environment cannot evaluate the risk
-            or constraints.
+        TypeError: if an action is of a kind that has no code, or the environment cannot evaluate the risk,
+            constraints or terminal value.
+        KeyError: if a terminal value reads or writes other entries.
 
     Examples:
         A search of one's own is one method:

@@ -97,16 +97,20 @@ def _acted(
 ) -> Tensor:
     """Codes ``(n, R, A)`` of the policy's actions, the first of them deterministic."""
     num, rows = batch
-    first = TensorDict({key: value[:1] for key, value in entries(state).items()}, batch_size=(1, rows))
-    code = codec.encode(policy(first).select(*codec.keys))
-    if num == 1:
-        return code
-    rest = TensorDict({key: value[1:] for key, value in entries(state).items()}, batch_size=(num - 1, rows))
-    p = action_distribution(policy, rest)
+    read = entries(state)
+    p = None
+    if num > 1:
+        p = action_distribution(policy, TensorDict(dict(read), batch_size=batch))
+        if p is None:
+            raise TypeError(f"policy must have a distribution to suggest {num} plans, got none")
+    point = None if p is None else getattr(p, "deterministic_sample", None)
+    if point is None:  # TorchRL's actor knows a substitute
+        point = policy(TensorDict({key: value[:1] for key, value in read.items()}, batch_size=(1, rows)))
+    code = codec.encode(point.select(*codec.keys) if isinstance(point, TensorDictBase) else point)[:1]
     if p is None:
-        raise TypeError(f"policy must have a distribution to suggest {num} plans, got none")
-    drawn = codec.encode(_drawn(p, codec, batch=(num - 1, rows), generator=generator))
-    return torch.cat([code, drawn.to(code.dtype)])
+        return code
+    drawn = codec.encode(_drawn(p, codec, batch, generator))
+    return torch.cat([code, drawn[1:].to(code.dtype)])
 
 
 def _drawn(
