@@ -217,6 +217,7 @@ class TestPromises:
         assert not any(value.requires_grad for value in first.values(True, True))
         assert set(first.keys(True)) == {"latent", *one.out_keys, "next"}  # no parameters of the policy
         other = suggested(one, states(4))
+        assert not other.requires_grad
         one.set_seed(1)
         assert not torch.equal(other[:, 1:], suggested(one, states(4))[:, 1:])
 
@@ -407,6 +408,22 @@ class TestCandidates:
             assert (same.sum(1) >= 1).all()  # one of them may be kept as an elite, too
         kept = (planner.rounds[1][0][:, 0, None] == planner.rounds[2][0]).flatten(-2).all(-1)
         assert kept.any(-1).all(), "the best plan is still a candidate"
+
+    @pytest.mark.parametrize(("num", "kept"), [(2, 8), (9, 1), (10, 0), (11, 0)])
+    def test_elites_are_kept_where_there_is_room_for_them(self, num: int, kept: int) -> None:
+        planner = make_planner(
+            Recorder,
+            Bounded(-1, 1, (2,)),
+            policy=tanh_policy(),
+            num_policy_candidates=num,
+            keep_elites=1.0,
+            top_k=12,
+        )
+        assert planner._num_kept == kept
+        planner.plan(states(2)["latent"], planner.family.cold((2,), 3))
+        first, second = (elites for elites, _ in planner.rounds)
+        again = (first[:, :1] == second).flatten(-2).all(-1).any(-1)
+        assert again.all() or num == 11, "the best plan is a candidate again"
 
     @every_planner
     def test_the_others_are_those_without_a_policy(self, cls: type[SamplingPlanner]) -> None:
