@@ -409,6 +409,22 @@ class TestCandidates:
         kept = (planner.rounds[1][0][:, 0, None] == planner.rounds[2][0]).flatten(-2).all(-1)
         assert kept.any(-1).all(), "the best plan is still a candidate"
 
+    def test_they_are_the_last(self) -> None:
+        seen: list[Tensor] = []
+
+        def cost(latent: Tensor, action: Tensor) -> Tensor:
+            seen.append(action)
+            return bumpy(latent, action)
+
+        planner = make_planner(CEM, Bounded(-1, 1, (2,)), cost, policy=tanh_policy(), num_policy_candidates=4)
+        state = planner.generator.get_state()
+        plans = suggested(planner, states(2))
+        planner.generator.set_state(state)
+        seen.clear()
+        planner.plan(states(2)["latent"], planner.family.cold((2,), 3))
+        assert [actions.shape for actions in seen] == [(2, 12, 3, 2)] * 2
+        assert all(torch.equal(actions[:, -4:], plans.double()) for actions in seen)
+
     @pytest.mark.parametrize(("num", "kept"), [(2, 8), (9, 1), (10, 0), (11, 0)])
     def test_elites_are_kept_where_there_is_room_for_them(self, num: int, kept: int) -> None:
         planner = make_planner(
