@@ -509,8 +509,26 @@ class TestStepped:
             td.select("th", "thdot", "params")
         )
         torch.testing.assert_close(td["plan_stats", "cost"], again["plan_stats", "cost"])
+        assert planner(observed("angle").reset())["action"].shape == (1,)
         with pytest.raises(KeyError, match=r"missing \['angle'\]"):
             planner(td.exclude("angle"))
+
+    def test_heads_of_a_tree_search_read_observations_too(self) -> None:
+        env = TransformedEnv(Walk(), UnsqueezeTransform(-1, in_keys=["position"], out_keys=["seen"]))
+        value = ValueOperator(Column(lambda seen: -seen[..., 0, 0]), in_keys=["seen"])
+        same = ValueOperator(Column(lambda position: -position[..., 0]), in_keys=["position"])
+        logits = TensorDictModule(lambda seen: torch.cat([seen, -seen], -1)[..., 0, :], ["seen"], ["logits"])
+        td = env.reset().expand(2).clone().set("position", torch.tensor([[1.0], [-1.0]]))
+        td["seen"] = td["position"].unsqueeze(-1)
+        for name in ("leaf_value", "terminal_value"):
+            planner = TreeSearch(env, 3, 12, seed=0, return_stats=True, prior_policy=logits, **{name: value})
+            assert planner.in_keys.count("seen") == 1
+            other = TreeSearch(env, 3, 12, seed=0, return_stats=True, prior_policy=logits, **{name: same})
+            assert torch.equal(
+                planner(td.clone())["plan_stats", "value"], other(td.clone())["plan_stats", "value"]
+            )
+        assert "seen" in TreeSearch(env, 3, leaf_value=value).in_keys
+        assert "seen" not in TreeSearch(env, 3, leaf_value=same).in_keys
 
     def test_it_helps_a_pendulum(self) -> None:
         """Energy is worth something: a short horizon alone does not swing up."""
