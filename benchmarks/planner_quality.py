@@ -101,7 +101,7 @@ VARIANTS: dict[str, tuple[type, dict[str, Any]]] = {
     "MPPI": (MPPI, {}),
     "MPPI, pink noise": (MPPI, {"noise_beta": 1.0}),
     "MPPI, carried elites": (MPPI, {"carry_elites": 0.3}),
-    "MPPI, temperature 1": (MPPI, {"temperature": 1.0}),
+    "MPPI, temperature 0.5": (MPPI, {"temperature": 0.5}),
     "MPPI, warm_std 0.6": (MPPI, {"warm_std": 0.6}),
     "MPPI, warm_std 0.15": (MPPI, {"warm_std": 0.15}),
     "MPPI, not antithetic": (MPPI, {"antithetic": False}),

@@ -286,7 +286,7 @@ class TestUpdate:
 
     @pytest.mark.parametrize("normalize", [True, False])
     def test_mppi_where_even_the_difference_of_costs_overflows(self, normalize: bool) -> None:
-        planner = MPPI(lqr_env(), 2, normalize_costs=normalize)
+        planner = MPPI(lqr_env(), 2, temperature=0.5, normalize_costs=normalize)
         elites, costs = torch.randn(1, 3, 2, 2), torch.tensor([[-3e38, 3e38, 3e38]])
         mean, std = planner.update(cold(planner, 1), elites, costs)
         assert mean.isfinite().all()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import math
-import time
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.memory import Recalled
 from torchrl_vjepa.planners.noise import coloured_noise_factor
 from torchrl_vjepa.planners.plan import Plan, check_counts
@@ -133,8 +133,7 @@ class SamplingPlanner(Planner):
             raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
         if chunk_size is not None:
             check_counts(chunk_size=chunk_size)
-        if max_ms is not None and not 0 < max_ms < math.inf:
-            raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
+        check_max_ms(max_ms)
         if not 0 <= noise_beta <= 4:
             raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
         for name, fraction in (("keep_elites", keep_elites), ("carry_elites", carry_elites)):
@@ -191,7 +190,7 @@ class SamplingPlanner(Planner):
         generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
-        clock = None if self.max_ms is None else _Clock(self.max_ms)
+        clock = Clock(self.max_ms)
         kept = suggested
         for round_ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
@@ -214,7 +213,7 @@ class SamplingPlanner(Planner):
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
             proposal = family.confine(Proposal(mean, std), self.min_std)
-            if clock is not None and not clock.another(best_cost):
+            if not clock.another(best_cost):
                 break
         actions = codec.mode(proposal.mean) if self.output == "mean" else best
         if self._constrained and self.output == "mean":
@@ -280,19 +279,3 @@ class SamplingPlanner(Planner):
             kept = self.codec.mode(kept.clamp(self.low, self.high))
             last.copy_(torch.where(exists, kept, last))
         return candidates
-
-
-class _Clock:
-    """Whether there is time for another round."""
-
-    def __init__(self, max_ms: float) -> None:
-        self.last = time.perf_counter()
-        self.end = self.last + 1e-3 * max_ms
-        self.longest = 0.0
-
-    def another(self, result: Tensor) -> bool:
-        """Count one round, which ends when its result is there."""
-        result.sum().item()
-        now = time.perf_counter()
-        self.longest, self.last = max(self.longest, now - self.last), now
-        return now + self.longest <= self.end

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules.mcts import MCTSScore, PUCTScore
 
 from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State
 from torchrl_vjepa.planners.plan import Plan, check_counts
@@ -74,6 +75,8 @@ class TreeSearch(DiscretePlanner):
         leaf_value: latents ``(R, D)`` to values ``(R)``, expected sums of rewards (minus costs), higher is
             better; or a TensorDictModule that reads ``latent_key`` and writes ``state_value``, ``(R, 1)``. It
             is weighted by the predicted probability of being alive.
+        max_ms: time for a plan, in milliseconds: no simulation begins that would end later, if it took as
+            long as the longest before it; the plan is that of those that ran.
         output: the plan is the principal variation of ``"visits"``, or the ``"best"`` simulation.
         return_stats: also writes ``("plan_stats", "visits")``, of the actions at the root, ``(*B, n)``, and
             ``("plan_stats", "value")``, minus the mean cost of the simulations, ``(*B, 1)``.
@@ -119,6 +122,7 @@ class TreeSearch(DiscretePlanner):
         discount: float = 1.0,
         prior_policy: Head | None = None,
         leaf_value: Head | None = None,
+        max_ms: float | None = None,
         output: Literal["visits", "best"] = "visits",
         **kwargs: Any,
     ) -> None:
@@ -127,6 +131,7 @@ class TreeSearch(DiscretePlanner):
             raise ValueError(f"exploration must be finite and not negative, got {exploration}")
         if not 0 < discount <= 1:
             raise ValueError(f"discount must be in (0, 1], got {discount}")
+        check_max_ms(max_ms)
         if output not in ("visits", "best"):
             raise ValueError(f"output must be 'visits' or 'best', got {output!r}")
         super().__init__(env, planning_horizon, num_simulations, **kwargs)
@@ -153,6 +158,7 @@ class TreeSearch(DiscretePlanner):
                     f"{name} must be a TensorDictModule for {type(env).__name__}, which has no latent, got "
                     f"{type(head).__name__}"
                 )
+        self.max_ms = max_ms
         self.num_simulations, self.exploration, self.discount = num_simulations, exploration, discount
         self.prior_policy: Any = prior_policy
         self.leaf_value: Any = leaf_value
@@ -182,8 +188,11 @@ class TreeSearch(DiscretePlanner):
         search = _Search(self, self._expansion(state), room)
         if any_warm:
             search.follow(index, warm)
+        clock = Clock(self.max_ms)
         for gumbel in noise:
             search.simulate(gumbel)
+            if not clock.another(search.best_cost):
+                break
         tree = search.tree
         actions, shares = tree.principal_variation()
         if self.output == "best":
