@@ -5,9 +5,10 @@ process, on one thread, in turn; time is processor time, and a ratio is the medi
 rounds. Before anything is timed, the plans are compared: the floor (a hand-written loop, sampling included)
 must give the very plan of the library, TorchRL's planners the same optimum. "products" are the matrix
 products of a plan alone. With "one by one", environments are planned for one after another; "chunked"
-imagines a quarter of the candidates at a time, "bf16" has LatentEnv(rollout_dtype=torch.bfloat16), "short"
-three quarters of the iterations besides (see planner_quality.py for what that costs), "compiled" the default
-torch.compile; all against the full floor. pytorch_mppi joins where it is installed (the extra "benchmarks"),
+imagines a quarter of the candidates at a time, "half" draws half of them, "decaying" 0.8 of those of the
+round before, "bf16" has LatentEnv(rollout_dtype=torch.bfloat16), "short" three quarters of the iterations
+besides (see planner_quality.py for what that costs), "compiled" the default torch.compile; all against the
+full floor. pytorch_mppi joins where it is installed (the extra "benchmarks"),
 over the network and the cost of the floor.
 """
 
@@ -51,6 +52,8 @@ PLANNERS = (
     "MPPI",
     "CEM one by one",
     "CEM chunked",
+    "CEM half",
+    "CEM decaying",
     "CEM bf16",
     "CEM bf16 short",
     "CEM compiled",
@@ -160,7 +163,7 @@ class Problem:
             kwargs.pop("env", self.env),
             self.horizon,
             optim_steps or self.optim_steps,
-            self.candidates,
+            kwargs.pop("candidates", self.candidates),
             self.top_k,
             min_std=MIN_STD,
             seed=self.seed,
@@ -253,6 +256,10 @@ class Problem:
             return self.ours(CEM, chunk_size=self.candidates // 4)
         if name == "compiled":
             return self.ours(CEM, compile=True)
+        if name == "half":
+            return self.ours(CEM, candidates=self.candidates // 2)
+        if name == "decaying":
+            return self.ours(CEM, population_decay=0.8)
         rounds = max(1, 3 * self.optim_steps // 4) if name == "bf16 short" else None
         return self.ours(CEM, rounds, env=self.make_env(rollout_dtype=torch.bfloat16))
 
