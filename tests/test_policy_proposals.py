@@ -132,7 +132,7 @@ def states(*batch: int) -> TensorDict:
 
 def suggested(planner: SamplingPlanner, td: TensorDict) -> Tensor:
     start = planner.family.cold(td.batch_size, planner.planning_horizon)
-    return planner._suggested(planner._source.planning_state(td), start)
+    return planner._policy_plans(planner._source.planning_state(td), start)
 
 
 class TestPromises:
@@ -303,6 +303,24 @@ class TestWhatItDoes:
         imagined, stepped = one(states(3)), two(states(3))
         torch.testing.assert_close(imagined["plan_stats", "cost"], stepped["plan_stats", "cost"])
 
+    @pytest.mark.parametrize("stepped", [False, True])
+    def test_actions_are_held_as_those_of_plans(self, stepped: bool) -> None:
+        spec = Bounded(-1, 1, (2,), **F64)
+        env: Any = LatentEnv(drift, action_spec=spec, cost=bumpy, latent_dim=1, **F64)
+        env = TransformedEnv(env) if stepped else env
+        policy = tanh_policy()
+        planner = CEM(env, 6, 2, 12, action_repeat=2, policy=policy, num_policy_candidates=3, seed=0)
+        plans = planner._policy_plans(planner._source.planning_state(states(4)), planner.family.cold((4,), 3))
+        assert plans.shape == (4, 3, 3, 2)
+        td = states(4)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            for step in range(3):
+                action = policy(td.clone())["action"]
+                torch.testing.assert_close(plans[:, 0, step], action)
+                for _ in range(2):
+                    td["latent"] = drift(td["latent"], action).mean
+        assert planner(states(4))["next", "plan"].shape == (4, 6, 2)
+
     def test_samples_have_the_distribution_of_the_policy_in_every_step(self) -> None:
         front = TensorDictModule(lambda z: (0.5 * z, 0.2 + 0 * z), ["latent"], ["loc", "scale"])
         policy = ProbabilisticActor(
@@ -367,7 +385,7 @@ class TestWhatItDoes:
         )
         planner = make_planner(CEM, Bounded(-1, 1, (2,)), policy=policy, horizon=2)
         start = Proposal(torch.full((3, 2, 2), 0.25), torch.ones(3, 2, 2))
-        plans = planner._suggested(states(3)["latent"], start)
+        plans = planner._policy_plans(states(3)["latent"], start)
         assert (plans[..., 1] == 0.25).all()
         expected = states(3)["latent"].clamp(-1, 1).float()
         torch.testing.assert_close(plans[:, 0, :1, 0], expected)
@@ -440,6 +458,44 @@ class TestCandidates:
         first, second = (elites for elites, _ in planner.rounds)
         again = (first[:, :1] == second).flatten(-2).all(-1).any(-1)
         assert again.all() or num == 11, "the best plan is a candidate again"
+
+    @pytest.mark.parametrize("num", [1, 4, 9])
+    def test_beside_elites_that_are_carried_and_a_population_that_decays(self, num: int) -> None:
+        planner = make_planner(
+            Recorder,
+            Bounded(-1, 1, (2,)),
+            policy=tanh_policy(),
+            num_policy_candidates=num,
+            optim_steps=4,
+            top_k=2,
+            keep_elites=0.5,
+            carry_elites=1.0,
+            population_decay=0.5,
+        )
+        sizes: list[int] = []
+        costs_of = planner._evaluator
+
+        def spied(state: Any) -> Any:
+            evaluate = costs_of(state)
+
+            def evaluated(candidates: Tensor) -> Tensor:
+                sizes.append(candidates.shape[-3])
+                assert torch.equal(candidates[..., -num:, :, :], plans)
+                return evaluate(candidates)
+
+            return evaluated
+
+        planner._evaluator = spied
+        td = states(2)
+        for _ in range(2):
+            state = planner.generator.get_state()
+            plans = suggested(planner, td)
+            planner.generator.set_state(state)
+            sizes.clear()
+            planner(td)
+            least = max(4, num + 2 + planner._num_kept)
+            assert sizes == [12, max(6, least), max(3, least), max(2, least)]
+            td = states(2).update(td["next"])
 
     @every_planner
     def test_the_others_are_those_without_a_policy(self, cls: type[SamplingPlanner]) -> None:

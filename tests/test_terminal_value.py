@@ -431,6 +431,26 @@ class TestSearches:
             total = total + discount**k * bumpy(z, action)
         torch.testing.assert_close(plan.best_cost.double(), total + discount**4 * wave(z))
 
+    @pytest.mark.parametrize("ends", [False, True])
+    @pytest.mark.parametrize(
+        ("cls", "kwargs"),
+        [
+            (ExhaustiveSearch, {"warm_start": True}),
+            (TreeSearch, {"num_simulations": 25}),
+            (CEM, {"num_candidates": 16}),
+        ],
+    )
+    def test_it_is_behind_the_horizon_of_actions_that_are_held(
+        self, cls: type[Planner], kwargs: dict[str, Any], ends: bool
+    ) -> None:
+        end = TensorDictModule(lambda z: z[..., :1], ["latent"], ["termination_logit"])
+        env = discrete_env(termination_model=end if ends else None)
+        planner = cls(env, 6, action_repeat=2, terminal_value=minus_wave, seed=0, **kwargs)
+        plan = planner.plan(latents(3), planner.family.cold((3,), 3))
+        held = plan.best.double().repeat_interleave(2, dim=-2).unsqueeze(-3)
+        cost = env.objective(latents(3), held, terminal_value=minus_wave).squeeze(-1)
+        torch.testing.assert_close(plan.best_cost.double(), cost, rtol=1e-5, atol=1e-5)
+
     def test_it_is_no_leaf_value(self) -> None:
         with pytest.raises(ValueError, match="at most one of leaf_value and terminal_value must be given"):
             TreeSearch(discrete_env(), 3, terminal_value=minus_wave, leaf_value=minus_wave)

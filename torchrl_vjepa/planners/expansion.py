@@ -13,7 +13,16 @@ from torchrl_vjepa.distributions import point_estimate
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.env_objective import EnvObjective
 
-__all__ = ["ALIVE", "EnvExpansion", "Expansion", "LatentExpansion", "State", "entries", "expansion_from"]
+__all__ = [
+    "ALIVE",
+    "EnvExpansion",
+    "Expansion",
+    "HeldExpansion",
+    "LatentExpansion",
+    "State",
+    "entries",
+    "expansion_from",
+]
 
 State = dict[NestedKey, Tensor]
 
@@ -229,6 +238,68 @@ class EnvExpansion:
         return self.expand(state, action, 0)[0]
 
 
+class HeldExpansion:
+    r"""Steps of a model that each hold their action for ``repeat`` steps of another.
+
+    They cost :math:`\sum_{j=0}^{r-1} \gamma^j c_j`.
+
+    Args:
+        expansion: of single steps.
+        repeat: steps ``r`` in one.
+        discount: :math:`\gamma`.
+
+    Examples:
+        >>> from torchrl.data import OneHot
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> env = LatentEnv(
+        ...     lambda latent, action: Delta(latent + action),
+        ...     action_spec=OneHot(2),
+        ...     cost=quadratic_cost(torch.zeros(2)),
+        ...     latent_dim=2,
+        ... )
+        >>> leap = HeldExpansion(LatentExpansion(env, torch.zeros(5, 2), 6), repeat=2)
+        >>> leap.expand(leap.root, torch.tensor([1.0, 0.0]).expand(5, 2), 0)[1]  # 1 + 4
+        tensor([5., 5., 5., 5., 5.])
+    """
+
+    def __init__(self, expansion: Expansion, repeat: int, discount: float = 1.0) -> None:
+        self.expansion, self.repeat, self.discount = expansion, repeat, discount
+        self.root = expansion.root
+
+    def expand(self, state: State, action: Tensor, step: int | Tensor) -> tuple[State, Tensor]:
+        """All steps for which the action is held.
+
+        Args:
+            state: entries with batch ``(R, *X)``.
+            action: codes, of shape ``(R, *X, A)``.
+            step: how many times an action was held before: one number, or one for each row, ``(R)``.
+
+        Returns:
+            Next state, and the costs, of shape ``(R, *X)``.
+        """
+        first = step * self.repeat
+        state, total = self.expansion.expand(state, action, first)
+        for j in range(1, self.repeat):
+            state, cost = self.expansion.expand(state, action, first + j)
+            total = total + self.discount**j * cost
+        return state, total
+
+    def move(self, state: State, action: Tensor) -> State:
+        """All steps for which the action is held, without their costs.
+
+        Args:
+            state: entries with any batch ``*B``.
+            action: codes, of shape ``(*B, A)``.
+
+        Returns:
+            Next state.
+        """
+        for _ in range(self.repeat):
+            state = self.expansion.move(state, action)
+        return state
+
+
 def entries(state: State) -> State:
     """What heads read of a state: all but :data:`ALIVE`.
 
@@ -245,16 +316,20 @@ def entries(state: State) -> State:
     return {key: value for key, value in state.items() if key != ALIVE}
 
 
-def expansion_from(source: LatentEnv | EnvObjective, state: Any, horizon: int) -> Expansion:
-    """Steps of a source of plans.
+def expansion_from(
+    source: LatentEnv | EnvObjective, state: Any, horizon: int, repeat: int = 1, discount: float = 1.0
+) -> Expansion:
+    """Decisions in a source of plans.
 
     Args:
         source: a latent environment, or one that is stepped as an objective.
         state: what its ``planning_state`` gives.
         horizon: steps ``H`` that are looked ahead.
+        repeat: steps for which each action is held.
+        discount: of the costs while it is held.
 
     Returns:
-        The steps.
+        The steps that a decision takes, as one.
 
     Examples:
         >>> from torchrl.envs import PendulumEnv
@@ -263,6 +338,9 @@ def expansion_from(source: LatentEnv | EnvObjective, state: Any, horizon: int) -
         >>> expansion_from(source, source.planning_state(env.reset()), 3).root["th"].shape
         torch.Size([1])
     """
+    expansion: Expansion
     if isinstance(source, EnvObjective):
-        return EnvExpansion(source, state)
-    return LatentExpansion(source, state, horizon)
+        expansion = EnvExpansion(source, state)
+    else:
+        expansion = LatentExpansion(source, state, horizon)
+    return expansion if repeat == 1 else HeldExpansion(expansion, repeat, discount)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules.mcts import MCTSScore, PUCTScore
 
+from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
 from torchrl_vjepa.planners.plan import Plan, check_counts
@@ -73,6 +74,8 @@ class TreeSearch(DiscretePlanner):
             better; or a TensorDictModule that reads ``latent_key`` and writes ``state_value``, ``(R, 1)``. It
             is weighted by the predicted probability of being alive. Rollouts that end in a value instead take
             ``terminal_value``.
+        max_ms: time for a plan, in milliseconds: no simulation begins that would end later, if it took as
+            long as the longest before it; the plan is that of those that ran.
         output: the plan is the principal variation of ``"visits"``, or the ``"best"`` simulation.
         return_stats: also writes ``("plan_stats", "visits")``, of the actions at the root, ``(*B, n)``, and
             ``("plan_stats", "value")``, minus the mean cost of the simulations, ``(*B, 1)``.
@@ -118,6 +121,7 @@ class TreeSearch(DiscretePlanner):
         discount: float = 1.0,
         prior_policy: Head | None = None,
         leaf_value: Head | None = None,
+        max_ms: float | None = None,
         output: Literal["visits", "best"] = "visits",
         **kwargs: Any,
     ) -> None:
@@ -126,6 +130,7 @@ class TreeSearch(DiscretePlanner):
             raise ValueError(f"exploration must be finite and not negative, got {exploration}")
         if not 0 < discount <= 1:
             raise ValueError(f"discount must be in (0, 1], got {discount}")
+        check_max_ms(max_ms)
         if output not in ("visits", "best"):
             raise ValueError(f"output must be 'visits' or 'best', got {output!r}")
         super().__init__(env, planning_horizon, num_simulations, **kwargs)
@@ -152,6 +157,7 @@ class TreeSearch(DiscretePlanner):
         for name, (head, writes) in heads.items():
             if head is not None:
                 self.in_keys = [*self.in_keys, *admit_head(self._source, env, name, head, writes)]
+        self.max_ms = max_ms
         self.num_simulations, self.exploration, self.discount = num_simulations, exploration, discount
         self.prior_policy: Any = prior_policy
         self.leaf_value: Any = leaf_value
@@ -169,7 +175,7 @@ class TreeSearch(DiscretePlanner):
             The plan. ``best`` is the cheapest simulation, whose cost contains the leaf's value.
         """
         batch = proposal.mean.shape[:-2]
-        shape = (self.num_simulations, self.planning_horizon, self.num_actions)
+        shape = (self.num_simulations, self.num_decisions, self.num_actions)
         noise = proposal.mean.new_empty(shape).exponential_(generator=self._generator).log().neg()
         if not batch.numel():
             empty = proposal.mean.new_zeros(*batch, self.num_actions)
@@ -177,12 +183,15 @@ class TreeSearch(DiscretePlanner):
             return Plan(*proposal, proposal.mean, empty[..., 0], statistics)
         index, warm = self._numbered(proposal)
         any_warm = bool(warm.any())
-        room = 1 + self.num_simulations + self.planning_horizon * any_warm
+        room = 1 + self.num_simulations + self.num_decisions * any_warm
         search = _Search(self, self._expansion(state), room)
         if any_warm:
             search.follow(index, warm)
+        clock = Clock(self.max_ms)
         for gumbel in noise:
             search.simulate(gumbel)
+            if not clock.another(search.best_cost):
+                break
         tree = search.tree
         actions, shares = tree.principal_variation()
         if self.output == "best":
@@ -212,7 +221,7 @@ class _Search:
     """One call: the trees, the states of their nodes, and the cheapest simulation so far."""
 
     def __init__(self, planner: TreeSearch, expansion: Expansion, num_nodes: int) -> None:
-        self.planner, self.expansion, self.horizon = planner, expansion, planner.planning_horizon
+        self.planner, self.expansion, self.horizon = planner, expansion, planner.num_decisions
         root, self.latent_key = expansion.root, latent_key_of(planner._source)
         alive = root[ALIVE]
         self.rows = torch.arange(alive.shape[0], device=alive.device)
@@ -318,7 +327,7 @@ class _Search:
         return -self._weight(depth) * (alive * value).to(self.paid.dtype)
 
     def _weight(self, step: int | Tensor) -> Tensor | float:
-        discount = self.planner.discount
+        discount = self.planner.discount**self.planner.action_repeat
         return discount**step if isinstance(step, int) else discount ** step.to(self.paid.dtype)
 
     def _keep(self, state: State, paid: Tensor) -> None:
