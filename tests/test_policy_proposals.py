@@ -459,15 +459,15 @@ class TestCandidates:
         again = (first[:, :1] == second).flatten(-2).all(-1).any(-1)
         assert again.all() or num == 11, "the best plan is a candidate again"
 
-    @pytest.mark.parametrize("num", [1, 4, 9])
-    def test_beside_elites_that_are_carried_and_a_population_that_decays(self, num: int) -> None:
+    @pytest.mark.parametrize(("num", "top_k"), [(1, 2), (4, 2), (9, 2), (9, 6)])
+    def test_beside_elites_that_are_carried_and_a_population_that_decays(self, num: int, top_k: int) -> None:
         planner = make_planner(
             Recorder,
             Bounded(-1, 1, (2,)),
             policy=tanh_policy(),
             num_policy_candidates=num,
             optim_steps=4,
-            top_k=2,
+            top_k=top_k,
             keep_elites=0.5,
             carry_elites=1.0,
             population_decay=0.5,
@@ -493,8 +493,8 @@ class TestCandidates:
             planner.generator.set_state(state)
             sizes.clear()
             planner(td)
-            least = max(4, num + 2 + planner._num_kept)
-            assert sizes == [12, max(6, least), max(3, least), max(2, least)]
+            least = max(2 * top_k, num + 2 + planner._num_kept)
+            assert sizes == [12, *(max(size, least) for size in (6, 3, 2))]
             td = states(2).update(td["next"])
 
     @every_planner
