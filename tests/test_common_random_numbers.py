@@ -6,8 +6,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from tensordict.nn.distributions import OneHotCategorical as TensorDictOneHot
+from tensordict.nn.distributions.truncated_normal import TruncatedNormal as TensorDictTruncated
 from torch import Tensor
 from torch.distributions import (
+    Bernoulli,
+    Beta,
     Categorical,
     Cauchy,
     Distribution,
@@ -21,10 +25,22 @@ from torch.distributions import (
     TransformedDistribution,
     Uniform,
 )
+from torch.distributions import OneHotCategorical as TorchOneHot
 from torch.distributions.transforms import AffineTransform, TanhTransform
+from torchrl.modules import Delta as TorchRLDelta
+from torchrl.modules import (
+    MaskedCategorical,
+    MaskedOneHotCategorical,
+    OneHotCategorical,
+    OneHotOrdinal,
+    Ordinal,
+    TanhDelta,
+    TanhNormal,
+    TruncatedNormal,
+)
 
 from torchrl_vjepa.belief import ParticleBelief
-from torchrl_vjepa.common_random_numbers import CommonNoise, sample_common
+from torchrl_vjepa.common_random_numbers import CommonNoise, has_common_noise, sample_common
 from torchrl_vjepa.distributions import Delta, diag_gaussian
 
 ROOT = torch.tensor([[1.0, 0.0], [0.7, 0.5]], dtype=torch.float64)
@@ -81,6 +97,12 @@ FAMILIES: dict[str, Callable[[Tensor], Distribution]] = {
     "laplace": lambda loc: Independent(Laplace(loc, 0.5, validate_args=False), 1),
     "uniform": lambda loc: Independent(Uniform(loc - 1, loc + 1, validate_args=False), 1),
     "cauchy": lambda loc: Independent(Cauchy(loc, 0.5, validate_args=False), 1),
+    "tanh_normal": lambda loc: TanhNormal(loc, torch.full_like(loc, 0.5), low=-2.0, high=3.0),
+    "truncated": lambda loc: TruncatedNormal(loc, torch.full_like(loc, 0.5), low=-1.0, high=2.0),
+    "truncated_tensordict": lambda loc: Independent(
+        TensorDictTruncated(loc, torch.full_like(loc, 0.5), -torch.ones_like(loc), 2 * torch.ones_like(loc)),
+        1,
+    ),
 }
 every_family = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
 
@@ -185,3 +207,85 @@ def test_the_comparison_of_two_plans_loses_its_noise() -> None:
     common = CommonNoise(walk, generator())(latent, action).mean.square().sum(-1)
     alone = walk(latent, action).sample().square().sum(-1)
     assert (common[:, 0] - common[:, 1]).var() < 0.05 * (alone[:, 0] - alone[:, 1]).var()
+
+
+MASK = torch.tensor([True, False, True, True])
+LISTED = torch.tensor([0, 2, 3])
+
+CHOICES: dict[str, Callable[[Tensor], Distribution]] = {
+    "categorical": lambda logits: Categorical(logits=logits),
+    "ordinal": Ordinal,
+    "one_hot": lambda logits: OneHotCategorical(logits=logits),
+    "one_hot_tensordict": lambda logits: TensorDictOneHot(logits=logits),
+    "one_hot_torch": lambda logits: TorchOneHot(logits=logits),
+    "one_hot_ordinal": OneHotOrdinal,
+    "masked": lambda logits: MaskedCategorical(logits=logits, mask=MASK.expand_as(logits)),
+    "masked_one_hot": lambda logits: MaskedOneHotCategorical(logits=logits, mask=MASK.expand_as(logits)),
+    "listed": lambda logits: MaskedCategorical(logits=logits, indices=LISTED.expand(*logits.shape[:-1], 3)),
+    "listed_one_hot": lambda logits: MaskedOneHotCategorical(
+        logits=logits, indices=LISTED.expand(*logits.shape[:-1], 3)
+    ),
+    "bits": lambda logits: Independent(Bernoulli(logits=logits), 1),
+}
+every_choice = pytest.mark.parametrize("family", CHOICES.values(), ids=CHOICES)
+
+
+@every_choice
+def test_choices_are_common_and_have_their_frequencies(family: Callable[[Tensor], Distribution]) -> None:
+    num = 20_000
+    logits = torch.tensor([0.5, -0.3, 0.2, -1.0])
+    before = torch.get_rng_state()
+    p = family(logits.expand(num, 2, 4))
+    draws = sample_common(p, generator=generator())
+    assert torch.equal(before, torch.get_rng_state())
+    torch.manual_seed(0)
+    other = family(logits.expand(num, 4)).sample()  # TorchRL's lists of indices know one batch dimension
+    assert draws[:, 0].shape == other.shape
+    assert draws.dtype == other.dtype
+    assert torch.equal(draws[:, 0], draws[:, 1])
+
+    def counted(value: Tensor) -> Tensor:
+        return torch.nn.functional.one_hot(value, 4).float() if value.ndim == 1 else value.float()
+
+    one, two = (counted(value) for value in (draws[:, 0], other))
+    error = ((one.var(0) + two.var(0)) / num).sqrt()
+    assert ((one.mean(0) - two.mean(0)).abs() <= 5 * error).all()
+    assert has_common_noise(p)
+
+
+@every_choice
+def test_choices_move_with_their_probabilities(family: Callable[[Tensor], Distribution]) -> None:
+    """Of two rows that are nearly alike only few draws differ."""
+    logits = torch.tensor([[0.5, -0.3, 0.2, -1.0], [0.51, -0.31, 0.2, -1.01]]).expand(2000, 2, 4)
+    draws = sample_common(family(logits), generator=generator()).reshape(2000, 2, -1)
+    assert 0 < (draws[:, 0] != draws[:, 1]).any(-1).float().mean() < 0.03
+
+
+def test_what_has_no_probability_is_never_drawn() -> None:
+    probs = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0])
+    draws = sample_common(Categorical(probs=probs.expand(200_000, 10)), generator=generator())
+    assert draws.min() == 1
+    assert draws.max() == 7
+    # Parallel sums may be rounded to less than the largest number drawn.
+    cumsum = Tensor.cumsum
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Tensor, "cumsum", lambda x, dim: 0.999 * cumsum(x, dim))
+        patch.setattr(torch, "rand", lambda shape, **kwargs: torch.ones(shape))
+        assert (sample_common(Categorical(probs=probs.expand(3, 10))) == 7).all()
+
+
+def test_points_of_every_house_are_themselves() -> None:
+    loc = torch.randn(4, 3, 2)
+    assert torch.equal(sample_common(TorchRLDelta(loc)), loc)
+    point = TanhDelta(loc, low=-1.0, high=1.0)
+    assert torch.equal(sample_common(point), point.mode)
+
+
+def test_which_families_have_common_noise() -> None:
+    assert all(has_common_noise(family(torch.zeros(2, 2).double())) for family in FAMILIES.values())
+    concentration = torch.ones(2, 3)
+    for p in (StudentT(4 * concentration), Independent(Beta(concentration, concentration), 1)):
+        assert not has_common_noise(p)
+        assert not has_common_noise(TransformedDistribution(p, [AffineTransform(0.0, 2.0)]))
+    parts = Independent(StudentT(torch.ones(2, 3, 2)), 1)
+    assert not has_common_noise(MixtureSameFamily(Categorical(torch.ones(2, 3)), parts))

@@ -254,7 +254,7 @@ class TestBudget:
             now[0] += 0.010
             return target(latent, action)
 
-        for max_ms, steps in ((5.0, 1), (10.0, 1), (35.0, 4), (1e6, 6)):
+        for max_ms, steps in ((5.0, 1), (25.0, 1), (35.0, 2), (45.0, 3), (1e6, 6)):
             cost = Counter(slow)
             planner = GradientMPC(
                 linear_env(cost=cost),

@@ -41,6 +41,7 @@ LAYERS = {
     "fusion": 2,
     "predictor": 2,
     "risk": 2,
+    "state_heads": 2,
     "baselines": 3,
     "diagnostics": 3,
     "envs": 3,

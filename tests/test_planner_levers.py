@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data import Bounded
+from torchrl.data import Bounded, OneHot
 from torchrl.modules import MLP
 
 from torchrl_vjepa import MPPI, LatentEnv, Predictor, rollout
@@ -29,7 +29,7 @@ from torchrl_vjepa.heads import (
     Head,
     LowRankGaussianHead,
 )
-from torchrl_vjepa.planners import CEM, Proposal, SamplingPlanner
+from torchrl_vjepa.planners import CEM, Proposal, SamplingPlanner, TreeSearch
 
 HEADS: dict[str, Callable[[], Head]] = {
     "delta": DeltaHead,
@@ -305,6 +305,25 @@ class TestTime:
         monkeypatch.setattr(time, "perf_counter", lambda: 0.01 * next(ticks))
         short = MPPI(make_env(), 3, 8, 16, seed=0, max_ms=21.0)(states())
         assert torch.equal(short["action"], MPPI(make_env(), 3, 2, 16, seed=0)(states())["action"])
+
+    @pytest.mark.parametrize(("max_ms", "simulations"), [(5.0, 1), (39.0, 3), (1000.0, 12), (None, 12)])
+    def test_tree_search_too(
+        self, max_ms: float | None, simulations: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        ticks = iter(range(100))
+        monkeypatch.setattr(time, "perf_counter", lambda: 0.01 * next(ticks))
+        env = LatentEnv(
+            Predictor(4, action_dim=2),
+            action_spec=OneHot(2),
+            cost=quadratic_cost(torch.ones(4)),
+        )
+        settings = {"seed": 0, "return_stats": True}
+        out = TreeSearch(env, 3, 12, max_ms=max_ms, **settings)(states())
+        assert (out["plan_stats", "visits"].sum(-1) == simulations).all()
+        few = TreeSearch(env, 3, simulations, **settings)(states())
+        assert torch.equal(out["plan_stats", "visits"], few["plan_stats", "visits"])
+        with pytest.raises(ValueError, match="max_ms must be positive and finite"):
+            TreeSearch(env, 3, max_ms=0.0)
 
     @pytest.mark.parametrize("max_ms", [0.0, -1.0, float("inf"), float("nan")])
     def test_bad_times_are_refused(self, max_ms: float) -> None:

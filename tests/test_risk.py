@@ -508,8 +508,8 @@ class TestSampling:
             Sampling.checked(*arguments)
 
     def test_defaults(self) -> None:
-        assert Sampling.checked(None, None, []) == (None, expectation, (), "energy")
-        assert Sampling.checked(3, worst_case, []) == (3, worst_case, (), "energy")
+        assert Sampling.checked(None, None, []) == (None, expectation, (), "energy", None)
+        assert Sampling.checked(3, worst_case, []) == (3, worst_case, (), "energy", None)
 
 
 @pytest.mark.parametrize("planner_class", [CEM, MPPI])

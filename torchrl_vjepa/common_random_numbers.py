@@ -11,8 +11,13 @@ import functools
 from collections.abc import Callable
 
 import torch
+from tensordict.nn.distributions import Delta as _TensorDictDelta
+from tensordict.nn.distributions import OneHotCategorical as _TensorDictOneHot
+from tensordict.nn.distributions.truncated_normal import TruncatedStandardNormal as _TensorDictTruncated
 from torch import Tensor
 from torch.distributions import (
+    Bernoulli,
+    Categorical,
     Cauchy,
     Distribution,
     Independent,
@@ -21,14 +26,19 @@ from torch.distributions import (
     MixtureSameFamily,
     MultivariateNormal,
     Normal,
+    OneHotCategorical,
     TransformedDistribution,
     Uniform,
 )
+from torchrl.modules import Delta as _TorchRLDelta
+from torchrl.modules import MaskedCategorical, MaskedOneHotCategorical
+from torchrl.modules import OneHotCategorical as _TorchRLOneHot
+from torchrl.modules.distributions.truncated_normal import TruncatedStandardNormal as _TorchRLTruncated
 
 from torchrl_vjepa.belief import ParticleBelief
 from torchrl_vjepa.distributions import Delta, NoiseDistribution, sample
 
-__all__ = ["CommonNoise", "common_particle", "sample_common"]
+__all__ = ["CommonNoise", "common_particle", "has_common_noise", "sample_common"]
 
 
 @functools.singledispatch
@@ -36,10 +46,12 @@ def sample_common(p: Distribution, *, generator: torch.Generator | None = None, 
     r"""One draw per distribution, :math:`Z^{(m,i)} = T_{p_{m,i}}(\varepsilon^{(m)})`.
 
     The first batch dimension of ``p`` counts samples, which get noise of their own; the rest are rows, which
-    share it. Gaussians (diagonal, full, low-rank) and the other location-scale families, their mixtures,
-    their transformations (flows) and particles are drawn so; what else there is, independently. Two equal
+    share it. Gaussians (diagonal, full, low-rank, truncated) and the other location-scale families, their
+    mixtures, their transformations (flows, ``TanhNormal``), particles, choices (categorical, one-hot, masked)
+    and bits are drawn so; what else there is, independently (:func:`has_common_noise` tells). Two equal
     distributions give equal draws, and draws move with the parameters. Of a mixture, a common uniform number
-    picks the component, in the order in which the components are kept; of particles, the particle.
+    picks the component, in the order in which the components are kept; of particles, the particle; a choice
+    is the quantile of its distribution at a common uniform number.
 
     Gradients flow to the parameters; for a mixture to those of the component that was picked, not to the
     weights. A family of one's own joins by ``@sample_common.register``.
@@ -79,8 +91,11 @@ def _uniform(shape: tuple[int, ...], like: Tensor, generator: torch.Generator | 
     return noise.clamp(limits.tiny, 1 - limits.eps)
 
 
-@sample_common.register
-def _(p: Delta, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
+@sample_common.register(_TensorDictDelta)
+@sample_common.register(_TorchRLDelta)
+def _(
+    p: _TensorDictDelta | _TorchRLDelta, *, generator: torch.Generator | None = None, own_dims: int = 0
+) -> Tensor:
     return p.rsample()
 
 
@@ -104,6 +119,67 @@ def _(
 ) -> Tensor:
     like = p.low if isinstance(p, Uniform) else p.loc
     return p.icdf(_uniform(_noise_shape(p.batch_shape, own_dims), like, generator))
+
+
+@sample_common.register(_TensorDictTruncated)
+@sample_common.register(_TorchRLTruncated)
+def _(
+    p: _TensorDictTruncated | _TorchRLTruncated,
+    *,
+    generator: torch.Generator | None = None,
+    own_dims: int = 0,
+) -> Tensor:
+    return p.icdf(_uniform(_noise_shape(p.batch_shape, own_dims), p.a, generator))
+
+
+@sample_common.register
+def _(p: Bernoulli, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
+    noise = _uniform(_noise_shape(p.batch_shape, own_dims), p.probs, generator)
+    return (noise < p.probs).to(p.probs.dtype)
+
+
+@sample_common.register
+def _(p: Categorical, *, generator: torch.Generator | None = None, own_dims: int = 0) -> Tensor:
+    return _choice(p.probs, own_dims, generator)
+
+
+@sample_common.register(_TensorDictOneHot)
+@sample_common.register(_TorchRLOneHot)
+@sample_common.register(OneHotCategorical)
+def _(
+    p: OneHotCategorical | _TorchRLOneHot | _TensorDictOneHot,
+    *,
+    generator: torch.Generator | None = None,
+    own_dims: int = 0,
+) -> Tensor:
+    choice = _choice(p.probs, own_dims, generator)
+    dtype = p.probs.dtype if isinstance(p, OneHotCategorical) else torch.long
+    return torch.nn.functional.one_hot(choice, p.probs.shape[-1]).to(dtype)
+
+
+@sample_common.register(MaskedCategorical)
+@sample_common.register(MaskedOneHotCategorical)
+def _(
+    p: MaskedCategorical | MaskedOneHotCategorical,
+    *,
+    generator: torch.Generator | None = None,
+    own_dims: int = 0,
+) -> Tensor:
+    choice = _choice(p.probs, own_dims, generator)
+    if p._sparse_mask:  # probabilities are those of the choices that the mask lists
+        listed = p._mask.expand(*choice.shape, p._mask.shape[-1])
+        choice = listed.gather(-1, choice.unsqueeze(-1)).squeeze(-1)
+    if not isinstance(p, MaskedOneHotCategorical):
+        return choice
+    return torch.nn.functional.one_hot(choice, p.num_samples)
+
+
+def _choice(probs: Tensor, own_dims: int, generator: torch.Generator | None) -> Tensor:
+    """The quantile of categorical distributions ``(M, *B, K)`` at uniform numbers."""
+    noise = _uniform((*_noise_shape(probs.shape[:-1], own_dims), 1), probs, generator)
+    cumulative = probs.cumsum(dim=-1)
+    # Divided by the sum as it is rounded, so that what has no probability at the end is never drawn.
+    return (noise >= cumulative[..., :-1] / cumulative[..., -1:]).sum(dim=-1)
 
 
 @sample_common.register
@@ -155,6 +231,29 @@ def _(p: TransformedDistribution, *, generator: torch.Generator | None = None, o
     for transform in p.transforms:
         value = transform(value)
     return value
+
+
+def has_common_noise(p: Distribution) -> bool:
+    """Whether :func:`sample_common` draws with common noise, or independently for want of a rule.
+
+    Args:
+        p: any distribution.
+
+    Returns:
+        Whether it does.
+
+    Examples:
+        >>> from torch.distributions import Beta
+        >>> has_common_noise(Independent(Normal(torch.zeros(2), 1.0), 1))
+        True
+        >>> has_common_noise(Independent(Beta(torch.ones(2), 1.0), 1))
+        False
+    """
+    if isinstance(p, MixtureSameFamily):
+        return has_common_noise(p.component_distribution)
+    if isinstance(p, (Independent, TransformedDistribution)) and not isinstance(p, NoiseDistribution):
+        return has_common_noise(p.base_dist)
+    return sample_common.dispatch(type(p)) is not sample_common.dispatch(object)
 
 
 def common_particle(

@@ -34,6 +34,7 @@ from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
 from torchrl_vjepa.priors import Prior
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, expectation, plan_cost
 from torchrl_vjepa.signatures import InitSignature
+from torchrl_vjepa.state_heads import Head, check_head
 
 __all__ = ["LatentEnv"]
 
@@ -266,6 +267,7 @@ class LatentEnv(ModelBasedEnvBase):
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: Literal["energy", "weight", "propose"] | None = None,
+        terminal_value: Head | None = None,
     ) -> Sampling:
         """How plans are evaluated where this is asked for: the environment's own settings for the rest.
 
@@ -274,6 +276,7 @@ class LatentEnv(ModelBasedEnvBase):
             risk: ``None``: the environment's.
             constraints: ``None``: the environment's.
             fusion: ``None``: the environment's.
+            terminal_value: ``None``: nothing is behind the horizon.
 
         Returns:
             The settings together; planning by posterior has the risk
@@ -283,6 +286,7 @@ class LatentEnv(ModelBasedEnvBase):
             ValueError: if ``num_samples`` is not positive, a risk or constraint has no samples to read, or
                 planning by posterior has none, no prior, or another risk.
             TypeError: if ``risk`` is not callable or ``constraints`` holds something else.
+            KeyError: if ``terminal_value`` reads something else than the latent.
         """
         sampled = self.how == "sample" or self.belief_key is not None
         own = self.num_samples if sampled else None
@@ -304,7 +308,12 @@ class LatentEnv(ModelBasedEnvBase):
                 "how must be 'sample' for a risk or a constraint on plans that start from a belief, got "
                 f"{self.how!r}: it would leave out the noise of the transitions"
             )
-        return settings
+        if terminal_value is not None:
+            readable, env = [self.latent_key], type(self).__name__
+            check_head(
+                "terminal_value", terminal_value, readable, env=env, has_latent=True, writes=["state_value"]
+            )
+        return settings._replace(terminal_value=terminal_value)
 
     def objective(
         self,
@@ -316,8 +325,9 @@ class LatentEnv(ModelBasedEnvBase):
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: Literal["energy", "weight", "propose"] | None = None,
+        terminal_value: Head | None = None,
     ) -> Tensor:
-        r"""Cost of candidate plans, :math:`\sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k})`.
+        r"""Cost of candidate plans, :math:`\sum_{k=0}^{H-1} c(Z_{t+k+1}, u_{t+k}) - a_H V(Z_{t+H})`.
 
         Gradients flow to ``actions`` if they require them.
 
@@ -329,6 +339,8 @@ class LatentEnv(ModelBasedEnvBase):
             risk: of their costs; ``None``: the environment's.
             constraints: on their latents and actions; ``None``: the environment's.
             fusion: how the prior enters; ``None``: the environment's.
+            terminal_value: :math:`V`, weighted by the probability :math:`a_H` of being alive; see
+                :func:`~torchrl_vjepa.state_heads.state_value`.
 
         Returns:
             Costs of shape ``(*B, N)``: of the point prediction, or the risk of ``M`` trajectories.
@@ -338,7 +350,12 @@ class LatentEnv(ModelBasedEnvBase):
                 require gradients and the energy of the prior gives none.
         """
         evaluate = self.objective_from(
-            state, num_samples=num_samples, risk=risk, constraints=constraints, fusion=fusion
+            state,
+            num_samples=num_samples,
+            risk=risk,
+            constraints=constraints,
+            fusion=fusion,
+            terminal_value=terminal_value,
         )
         return evaluate(actions, generator)
 
@@ -349,7 +366,8 @@ class LatentEnv(ModelBasedEnvBase):
 
         Args:
             state: see :meth:`objective`.
-            **settings: ``num_samples``, ``risk``, ``constraints``, ``fusion``; see :meth:`objective`.
+            **settings: ``num_samples``, ``risk``, ``constraints``, ``fusion``, ``terminal_value``; see
+                :meth:`objective`.
 
         Returns:
             ``(actions (*B, N, H, A), generator) -> costs (*B, N)``, for as long as no weight changes. What
@@ -378,7 +396,7 @@ class LatentEnv(ModelBasedEnvBase):
                 )
                 if actions.requires_grad and not evidence.requires_grad:
                     raise ValueError(NO_GRADIENT)
-                costs = world_model.fused_cost(latents, actions, evidence, prior.whole)
+                costs, reached = world_model.fused_cost(latents, actions, evidence, prior.whole), latents
                 if given.constraints:  # what violates is what the dynamics do, not what the prior asks for
                     latents = imagine(transition, start, actions, "sample", generator)
             else:
@@ -387,8 +405,10 @@ class LatentEnv(ModelBasedEnvBase):
                 costs = world_model.stage_cost(
                     latents, actions, density=prior.whole, needs_gradient=needs_gradient
                 )
-                costs = world_model.until_end(costs, latents, actions)
+                costs, reached = world_model.until_end(costs, latents, actions), latents
             costs = costs.sum(dim=-1)
+            if given.terminal_value is not None:
+                costs = costs - world_model.value_behind(given.terminal_value, reached, actions)
             if given.num_samples is None:
                 return costs
             return plan_cost(costs, given.risk, given.constraints, latents, actions)

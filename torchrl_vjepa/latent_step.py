@@ -15,6 +15,7 @@ from torchrl_vjepa.belief import Transition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.distributions import Density, point_estimate
 from torchrl_vjepa.priors import LatentDensity, Prior, Task
+from torchrl_vjepa.state_heads import Head, in_evaluation, state_value
 
 __all__ = ["NO_GRADIENT", "LatentStep"]
 
@@ -258,6 +259,32 @@ class LatentStep(TensorDictModuleBase):
         alive = torch.cat([torch.ones_like(alive[..., :1]), alive[..., :-1]], dim=-1)
         return alive * (costs + probability * self.termination_cost)
 
+    def value_behind(self, head: Head, latent: Tensor, action: Tensor) -> Tensor:
+        r"""What trajectories are worth behind their horizon, :math:`\prod_{k=1}^{H} (1 - p_k) \, V(Z_{t+H})`.
+
+        Args:
+            head: :math:`V`, see :func:`~torchrl_vjepa.state_heads.state_value`.
+            latent: next latents, of shape ``(*B, H, D)``.
+            action: flat, of shape ``(*B, H, A)``; the head must have a gradient where they require one.
+
+        Returns:
+            Of shape ``(*B)``.
+
+        Raises:
+            ValueError: if the head gives another shape, or no gradient.
+        """
+        last = latent[..., -1, :]
+        value = state_value(
+            head,
+            {self.latent_key: last},
+            last.shape[:-1],
+            self.latent_key,
+            needs_gradient=action.requires_grad,
+        )
+        if self.termination_model is None:
+            return value
+        return (1 - self.termination_probability(latent, action)).prod(dim=-1) * value
+
     def fused_cost(
         self, latent: Tensor, action: Tensor, log_evidence: Tensor, density: LatentDensity | None = None
     ) -> Tensor:
@@ -308,15 +335,8 @@ class LatentStep(TensorDictModuleBase):
         latent = latent.reshape(*batch, latent_dim)
         action = torch.linspace(-0.9, 1.1, 6 * action_dim, device=device, dtype=dtype)
         action = action.reshape(*batch, action_dim)
-        training = [module for module in self.modules() if module.training]
-        for module in training:
-            module.training = False
-        try:
-            with torch.no_grad():
-                self._probe(latent, action)
-        finally:
-            for module in training:
-                module.training = True
+        with in_evaluation(self):
+            self._probe(latent, action)
 
     def _probe(self, latent: Tensor, action: Tensor) -> None:
         batch = latent.shape[:-1]

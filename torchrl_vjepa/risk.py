@@ -27,7 +27,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -367,6 +367,7 @@ class Sampling(NamedTuple):
         risk: of their summed costs.
         constraints: on their latents and actions.
         fusion: how a prior enters.
+        terminal_value: what a trajectory is worth behind the horizon.
 
     Examples:
         >>> Sampling.checked(64, cvar(0.1), ()).num_samples
@@ -377,6 +378,7 @@ class Sampling(NamedTuple):
     risk: Risk
     constraints: tuple[ChanceConstraint, ...]
     fusion: str = "energy"
+    terminal_value: Any = None
 
     @classmethod
     def checked(

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.base import Planner
-from torchrl_vjepa.planners.expansion import EnvExpansion, Expansion, LatentExpansion
+from torchrl_vjepa.planners.expansion import Expansion, expansion_from
 from torchrl_vjepa.planners.proposal import Proposal
 
 __all__ = ["DiscretePlanner", "joint_choices"]
@@ -107,6 +107,8 @@ class DiscretePlanner(Planner):
     """
 
     choices: Tensor
+    #: Of the costs of single steps.
+    discount: float = 1.0
 
     def __init__(self, env: EnvBase, planning_horizon: int, optim_steps: int = 1, **kwargs: Any) -> None:
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
@@ -139,7 +141,5 @@ class DiscretePlanner(Planner):
         return source.sampling(**asked).num_samples is None
 
     def _expansion(self, state: Any) -> Expansion:
-        """Steps of the environment from a state of planning."""
-        if self._env_objective is not None:
-            return EnvExpansion(self._env_objective, state)
-        return LatentExpansion(self.env, state, self.planning_horizon)
+        """Decisions in the environment from a state of planning."""
+        return expansion_from(self._source, state, self.planning_horizon, self.action_repeat, self.discount)

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.risk import ChanceConstraint, Risk, Sampling, plan_cost
+from torchrl_vjepa.state_heads import Head, check_head, state_value
 
 __all__ = ["EnvObjective"]
 
@@ -84,6 +85,25 @@ class EnvObjective:
         # An outer done speaks for the groups below it, as in TorchRL's planners.
         self.done_keys = [k for k in done_keys if len(_path(k)) == depth]
 
+    @property
+    def head_keys(self) -> list[NestedKey]:
+        """What values and policies may read: the state, and what the environment observes."""
+        observed = map(unravel_key, self.env.observation_spec.keys(True, True))
+        return list(dict.fromkeys([*self.in_keys, *observed]))
+
+    def keep(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
+        """Also carry these entries from step to step, because a value or a policy reads them.
+
+        Args:
+            keys: some of :attr:`head_keys`.
+
+        Returns:
+            Those that were not carried before; they are :attr:`in_keys` now.
+        """
+        new = [key for key in map(unravel_key, keys) if key not in self.in_keys]
+        self.in_keys = [*self.in_keys, *new]
+        return new
+
     def planning_state(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The entries that the environment reads; no ``done``, no reward, nothing else.
 
@@ -109,6 +129,7 @@ class EnvObjective:
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
         fusion: str | None = None,
+        terminal_value: Head | None = None,
     ) -> Sampling:
         """How plans are evaluated where this is asked for.
 
@@ -117,13 +138,16 @@ class EnvObjective:
             risk: of their costs; ``None``: the expectation.
             constraints: none is supported.
             fusion: none is supported.
+            terminal_value: ``None``: nothing is behind the horizon.
 
         Returns:
             The settings together.
 
         Raises:
             ValueError: if ``num_samples`` is not positive, or a risk has no samples to read.
-            TypeError: if ``risk`` is not callable, or constraints or a fusion are given.
+            TypeError: if ``risk`` is not callable, constraints or a fusion are given, or
+                ``terminal_value`` is no TensorDictModule.
+            KeyError: if ``terminal_value`` reads something else than :attr:`head_keys`.
         """
         if fusion is not None:
             raise TypeError(
@@ -134,7 +158,10 @@ class EnvObjective:
                 "constraints need an environment with latents, as LatentEnv, got "
                 f"{type(self.env).__name__}; put the violation into its reward, or use a LatentEnv"
             )
-        return Sampling.checked(num_samples, risk, ())
+        if terminal_value is not None:
+            name, readable, env = "terminal_value", self.head_keys, type(self.env).__name__
+            check_head(name, terminal_value, readable, env=env, has_latent=False, writes=["state_value"])
+        return Sampling.checked(num_samples, risk, ())._replace(terminal_value=terminal_value)
 
     def objective(
         self,
@@ -145,8 +172,9 @@ class EnvObjective:
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
+        terminal_value: Head | None = None,
     ) -> Tensor:
-        """Minus the summed reward of candidate plans.
+        """Minus the summed reward of candidate plans, and minus the value of where they get.
 
         Args:
             state: what :meth:`planning_state` returned, with batch size ``*B``.
@@ -155,6 +183,8 @@ class EnvObjective:
             num_samples: trajectories per plan; ``None``: one, whose cost is taken as it is.
             risk: of their costs; ``None``: the expectation.
             constraints: none is supported.
+            terminal_value: a TensorDictModule that reads entries of :attr:`in_keys` and writes
+                ``state_value`` of shape ``(*B, 1)``; counts where a plan is not done at its end.
 
         Returns:
             Costs of shape ``(*B, N)``.
@@ -163,13 +193,14 @@ class EnvObjective:
             ValueError: if ``num_samples`` is not positive, or a risk has no samples to read.
             TypeError: if ``risk`` is not callable, or constraints are given.
         """
-        settings = self.sampling(num_samples, risk, constraints)
+        settings = self.sampling(num_samples, risk, constraints, terminal_value=terminal_value)
         num_samples, risk = settings.num_samples, settings.risk
         state = state.unsqueeze(-1).expand(actions.shape[:-2])
         if num_samples is None:
-            return self._stepped(state, actions)
+            return self._stepped(state, actions, terminal_value)
         state = state.expand(num_samples, *state.batch_size)
-        return plan_cost(self._stepped(state, actions.expand(num_samples, *actions.shape)), risk)
+        actions = actions.expand(num_samples, *actions.shape)
+        return plan_cost(self._stepped(state, actions, terminal_value), risk)
 
     def stepped(self, state: TensorDictBase, action: Tensor) -> TensorDictBase:
         """One step of the environment.
@@ -186,8 +217,8 @@ class EnvObjective:
             state.set(key, leaf)
         return self.env.step(state).get("next")
 
-    def _stepped(self, state: TensorDictBase, actions: Tensor) -> Tensor:
-        """Minus the summed reward of one plan per row: ``(*B)`` of ``(*B, H, A)``."""
+    def _stepped(self, state: TensorDictBase, actions: Tensor, head: Head | None) -> Tensor:
+        """Minus the summed reward, and the value, of one plan per row: ``(*B)`` of ``(*B, H, A)``."""
         batch = actions.shape[:-2]
         current = state
         cost = actions.new_zeros(batch)
@@ -199,7 +230,11 @@ class EnvObjective:
             for key in self.done_keys:
                 alive = alive & ~following.get(key).reshape(*batch, -1).any(dim=-1)
             current = current.select(*self.in_keys).update(following.select(*self.in_keys, strict=False))
-        return cost
+        if head is None:
+            return cost
+        reached = {key: current.get(key) for key in self.in_keys}
+        value = state_value(head, reached, batch, None, needs_gradient=actions.requires_grad)
+        return cost - torch.where(alive, value, 0.0).to(cost.dtype)
 
 
 def _path(key: NestedKey) -> tuple[str, ...]:

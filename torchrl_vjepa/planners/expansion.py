@@ -1,18 +1,28 @@
-"""One step of many imagined states at once: what searches over discrete actions expand."""
+"""One step of many imagined states at once: what searches expand, and policies act in."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from torchrl_vjepa.belief import ParticleBelief
 from torchrl_vjepa.distributions import point_estimate
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.env_objective import EnvObjective
 
-__all__ = ["ALIVE", "EnvExpansion", "Expansion", "LatentExpansion", "State"]
+__all__ = [
+    "ALIVE",
+    "EnvExpansion",
+    "Expansion",
+    "HeldExpansion",
+    "LatentExpansion",
+    "State",
+    "entries",
+    "expansion_from",
+]
 
 State = dict[NestedKey, Tensor]
 
@@ -33,8 +43,11 @@ class Expansion(Protocol):
         ...         self.root = {"latent": latent, ALIVE: torch.ones(latent.shape[:-1])}
         ...
         ...     def expand(self, state, action, step):
-        ...         latent = state["latent"] + action
-        ...         return {**state, "latent": latent}, latent.square().sum(-1)
+        ...         state = self.move(state, action)
+        ...         return state, state["latent"].square().sum(-1)
+        ...
+        ...     def move(self, state, action):
+        ...         return {**state, "latent": state["latent"] + action}
         >>> walk: Expansion = Walk(torch.zeros(5, 2))
         >>> walk.expand(walk.root, torch.ones(5, 2), 0)[1]
         tensor([2., 2., 2., 2., 2.])
@@ -54,6 +67,17 @@ class Expansion(Protocol):
             Next state, and the costs of the step, of shape ``(R, *X)``, weighted by what is alive.
         """
 
+    def move(self, state: State, action: Tensor) -> State:
+        """One step without its cost.
+
+        Args:
+            state: entries with any batch ``*B``.
+            action: codes, of shape ``(*B, A)``.
+
+        Returns:
+            Next state; what its episode has lived through may be left out of :data:`ALIVE`.
+        """
+
 
 class LatentExpansion:
     r"""Steps of a :class:`~torchrl_vjepa.envs.LatentEnv` by its point prediction.
@@ -64,8 +88,8 @@ class LatentExpansion:
     are those of :meth:`~torchrl_vjepa.envs.LatentEnv.objective`.
 
     Args:
-        env: the environment, whose next latent is the mean or the mode.
-        state: what its ``planning_state`` gives, with batch ``*B``.
+        env: the environment; where it samples the next latent, the mean is taken.
+        state: what its ``planning_state`` gives, with batch ``*B``; of a belief the mean is taken.
         horizon: steps ``H`` that are looked ahead.
 
     Examples:
@@ -85,7 +109,12 @@ class LatentExpansion:
 
     def __init__(self, env: LatentEnv, state: Tensor | TensorDictBase, horizon: int) -> None:
         self.env = env
-        latent = state if isinstance(state, Tensor) else state.get("latent")
+        if isinstance(state, Tensor):
+            latent = state
+        elif state.get("latent", None) is not None:
+            latent = state.get("latent")
+        else:
+            latent = ParticleBelief(state.get("particles"), state.get("log_weights")).mean
         batch = latent.shape[:-1]
         latent = latent.reshape(-1, latent.shape[-1])
         self.root: State = {env.latent_key: latent, ALIVE: torch.ones_like(latent[:, 0])}
@@ -107,17 +136,31 @@ class LatentExpansion:
         Returns:
             Next state, and the costs, of shape ``(R, *X)``.
         """
-        env, model, alive = self.env, self.env.world_model, state[ALIVE]
-        latent = state[env.latent_key]
+        model, alive = self.env.world_model, state[ALIVE]
+        moved = self.move(state, action)
+        latent = moved[self.env.latent_key]
         action = action.to(latent.dtype)
-        latent = point_estimate(model.transition(latent, action), env.how)
         task = self._tasks_at(step, latent.ndim - 2) if self.tasks else None
         cost = model.stage_cost(latent, action, task)
         if model.termination_model is not None:
             end = model.termination_probability(latent, action)
             cost = alive * (cost + end * model.termination_cost)
             alive = alive * (1 - end)
-        return {env.latent_key: latent, ALIVE: alive}, cost
+        return {**moved, ALIVE: alive}, cost
+
+    def move(self, state: State, action: Tensor) -> State:
+        """One step of the point prediction, without its cost.
+
+        Args:
+            state: holds latents of shape ``(*B, D)``.
+            action: codes, of shape ``(*B, A)``.
+
+        Returns:
+            Next state, as alive as before.
+        """
+        env, latent = self.env, state[self.env.latent_key]
+        p = env.world_model.transition(latent, action.to(latent.dtype))
+        return {**state, env.latent_key: point_estimate(p, "mode" if env.how == "mode" else "mean")}
 
     def _tasks_at(self, step: int | Tensor, extra: int) -> State:
         """Tasks of a step, ``(R, *1, *task)``: they broadcast against ``(R, *X)``."""
@@ -181,3 +224,123 @@ class EnvExpansion:
             value = following.get(key, None)
             after[key] = state[key] if value is None else value
         return after, cost
+
+    def move(self, state: State, action: Tensor) -> State:
+        """One step of the environment, without its cost.
+
+        Args:
+            state: what the environment reads, with batch ``*B``.
+            action: codes, of shape ``(*B, A)``.
+
+        Returns:
+            Next state.
+        """
+        return self.expand(state, action, 0)[0]
+
+
+class HeldExpansion:
+    r"""Steps of a model that each hold their action for ``repeat`` steps of another.
+
+    They cost :math:`\sum_{j=0}^{r-1} \gamma^j c_j`.
+
+    Args:
+        expansion: of single steps.
+        repeat: steps ``r`` in one.
+        discount: :math:`\gamma`.
+
+    Examples:
+        >>> from torchrl.data import OneHot
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> env = LatentEnv(
+        ...     lambda latent, action: Delta(latent + action),
+        ...     action_spec=OneHot(2),
+        ...     cost=quadratic_cost(torch.zeros(2)),
+        ...     latent_dim=2,
+        ... )
+        >>> leap = HeldExpansion(LatentExpansion(env, torch.zeros(5, 2), 6), repeat=2)
+        >>> leap.expand(leap.root, torch.tensor([1.0, 0.0]).expand(5, 2), 0)[1]  # 1 + 4
+        tensor([5., 5., 5., 5., 5.])
+    """
+
+    def __init__(self, expansion: Expansion, repeat: int, discount: float = 1.0) -> None:
+        self.expansion, self.repeat, self.discount = expansion, repeat, discount
+        self.root = expansion.root
+
+    def expand(self, state: State, action: Tensor, step: int | Tensor) -> tuple[State, Tensor]:
+        """All steps for which the action is held.
+
+        Args:
+            state: entries with batch ``(R, *X)``.
+            action: codes, of shape ``(R, *X, A)``.
+            step: how many times an action was held before: one number, or one for each row, ``(R)``.
+
+        Returns:
+            Next state, and the costs, of shape ``(R, *X)``.
+        """
+        first = step * self.repeat
+        state, total = self.expansion.expand(state, action, first)
+        for j in range(1, self.repeat):
+            state, cost = self.expansion.expand(state, action, first + j)
+            total = total + self.discount**j * cost
+        return state, total
+
+    def move(self, state: State, action: Tensor) -> State:
+        """All steps for which the action is held, without their costs.
+
+        Args:
+            state: entries with any batch ``*B``.
+            action: codes, of shape ``(*B, A)``.
+
+        Returns:
+            Next state.
+        """
+        for _ in range(self.repeat):
+            state = self.expansion.move(state, action)
+        return state
+
+
+def entries(state: State) -> State:
+    """What heads read of a state: all but :data:`ALIVE`.
+
+    Args:
+        state: the state.
+
+    Returns:
+        Its other entries.
+
+    Examples:
+        >>> entries({"latent": torch.zeros(2), ALIVE: torch.ones(())})
+        {'latent': tensor([0., 0.])}
+    """
+    return {key: value for key, value in state.items() if key != ALIVE}
+
+
+def expansion_from(
+    source: LatentEnv | EnvObjective, state: Any, horizon: int, repeat: int = 1, discount: float = 1.0
+) -> Expansion:
+    """Decisions in a source of plans.
+
+    Args:
+        source: a latent environment, or one that is stepped as an objective.
+        state: what its ``planning_state`` gives.
+        horizon: steps ``H`` that are looked ahead.
+        repeat: steps for which each action is held.
+        discount: of the costs while it is held.
+
+    Returns:
+        The steps that a decision takes, as one.
+
+    Examples:
+        >>> from torchrl.envs import PendulumEnv
+        >>> env = PendulumEnv()
+        >>> source = EnvObjective(env)
+        >>> expansion_from(source, source.planning_state(env.reset()), 3).root["th"].shape
+        torch.Size([1])
+    """
+    expansion: Expansion
+    if isinstance(source, EnvObjective):
+        expansion = EnvExpansion(source, state)
+    else:
+        expansion = LatentExpansion(source, state, horizon)
+    return expansion if repeat == 1 else HeldExpansion(expansion, repeat, discount)

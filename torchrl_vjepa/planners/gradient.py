@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import time
 import warnings
 from typing import Any, Literal
 
@@ -14,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_vjepa.distributions.modes import MakeOptimizer
 from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.squash import squash, unsquash
@@ -70,8 +70,9 @@ class GradientMPC(Planner):
             it does not depend on the others. Reads one number from the device in each step. ``None``:
             never.
         patience: see ``tolerance``.
-        max_ms: also stop after the step in which this time has passed, in milliseconds; waits for the device
-            after each step. How far planning gets then depends on the machine and the batch size.
+        max_ms: time for a plan, in milliseconds: no step begins that would end later, with the evaluation of
+            its end, if it took as long as the longest before it. The first always runs. Waits for the device
+            after each step, and how far planning gets depends on the machine and the batch size.
         **kwargs: see :class:`Planner`; ``("plan_stats", "std")`` is the spread of the starts.
 
     Raises:
@@ -120,8 +121,7 @@ class GradientMPC(Planner):
             raise ValueError(f"bounds must be 'reparameterize' or 'project', got {bounds!r}")
         if tolerance is not None and not 0 <= tolerance < 1:
             raise ValueError(f"tolerance must be in [0, 1), or None to never stop early, got {tolerance}")
-        if max_ms is not None and not 0 < max_ms < math.inf:
-            raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
+        check_max_ms(max_ms)
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
         if not self.codec.is_continuous:
             raise TypeError(
@@ -180,7 +180,7 @@ class GradientMPC(Planner):
         return Plan(found.actions, proposal.std, found.actions, found.cost)
 
     def _descend(self, state: Any, proposal: Proposal) -> _Incumbent:
-        begin = time.perf_counter()
+        clock = Clock(self.max_ms, reserve=1)  # for the last point
         starts = self._starts(proposal)
         bounds = (self.low, self.high)
         squashed = self.bounds == "reparameterize"
@@ -229,10 +229,8 @@ class GradientMPC(Planner):
                     x.copy_((self.cold_std * x).clamp(*bounds) / self.cold_std)
             if self.tolerance is not None and not found.improves(self.tolerance, self.patience):
                 return found
-            if self.max_ms is not None:
-                found.cost.sum().item()  # waits for the device
-                if 1e3 * (time.perf_counter() - begin) >= self.max_ms:
-                    break
+            if not clock.another(found.cost):
+                break
         with torch.no_grad():
             evaluate()
         return found

@@ -36,7 +36,8 @@ class MPPI(SamplingPlanner):
         optim_steps: see :class:`SamplingPlanner`.
         num_candidates: see :class:`SamplingPlanner`.
         top_k: see :class:`SamplingPlanner`; the classic algorithm has no elites: ``num_candidates``.
-        temperature: :math:`\lambda`, positive.
+        temperature: :math:`\lambda`, positive; the default is chosen by what it reaches on the noisy TV
+            (``docs/planners.md``).
         normalize_costs: divide costs by their standard deviation among the elites.
         **kwargs: see :class:`SamplingPlanner`.
 
@@ -71,7 +72,7 @@ class MPPI(SamplingPlanner):
         num_candidates: int = 512,
         top_k: int | None = None,
         *,
-        temperature: float = 0.5,
+        temperature: float = 1.0,
         normalize_costs: bool = True,
         **kwargs: Any,
     ) -> None:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import abc
 import math
-import time
 from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.clock import Clock, check_max_ms
+from torchrl_vjepa.planners.expansion import expansion_from
+from torchrl_vjepa.planners.memory import Recalled
 from torchrl_vjepa.planners.noise import coloured_noise_factor
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
+from torchrl_vjepa.planners.suggestions import policy_candidates, suggested_plans
 from torchrl_vjepa.risk import REJECTED_COST
 
 __all__ = ["SamplingPlanner"]
@@ -41,6 +45,11 @@ class SamplingPlanner(Planner):
     search heads for the least violation and a warning is given. The mean of feasible plans need not be
     feasible: ``output="best"`` returns a plan that was checked.
 
+    **A policy** suggests the last ``num_policy_candidates`` plans of every round: what it does in the model,
+    by point prediction (:func:`~torchrl_vjepa.planners.suggestions.suggested_plans`). So a learned policy is
+    a start that planning improves, together with a ``terminal_value`` as in TD-MPC2, and one of no use costs
+    its share of the candidates, no more.
+
     Args:
         env: see :class:`Planner`.
         planning_horizon: see :class:`Planner`.
@@ -51,8 +60,9 @@ class SamplingPlanner(Planner):
             the weight of the uniform distribution in the proposal.
         antithetic: draw noise in pairs of opposite sign.
         chunk_size: candidates (of every row) that are imagined at a time; all by default. The memory of a
-            round is then that of ``chunk_size`` candidates; the plan is the same up to rounding, except in
-            environments that draw their own noise.
+            plan is at most that of one with ``num_candidates=chunk_size``, and ten times the candidates
+            ``(*B, N, H, A)``; the plan is the same up to rounding, except in environments that draw their own
+            noise.
         max_ms: time for a plan, in milliseconds: no round begins that would end later, if it took as long as
             the longest before it. The first always runs; the plan is that of the rounds that did. Waits for
             the device after each round, and how far planning gets depends on the machine and the batch size.
@@ -62,10 +72,28 @@ class SamplingPlanner(Planner):
             power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
             (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
         keep_elites: fraction of the elites that are candidates again in the next round.
+        carry_elites: fraction of the last round's elites that are candidates in the first round of the next
+            step, one step on; needs ``warm_start``. They are carried in the tensordict, under ``plan_key``
+            with ``_elites`` appended.
+        population_decay: candidates of a round as a fraction of those of the round before, but at least
+            twice ``top_k``: later rounds search a smaller space. With 0.8, ``keep_elites`` and
+            ``carry_elites`` of 0.3 and ``noise_beta=2``, CEM is iCEM.
+        policy: a TorchRL actor (or a ``TensorDictSequential`` with one at its end) that reads the latent (of
+            an environment that is stepped: entries of its state) and writes the environment's action. Actions
+            outside the bounds are put inside, those that are not finite replaced by the proposal's mean. Its
+            draws are common to all rows: its distribution must be one that
+            :func:`~torchrl_vjepa.common_random_numbers.sample_common` has a rule for. ``None``: no
+            suggestions.
+        num_policy_candidates: how many of the ``num_candidates`` are the policy's: the first by its
+            deterministic action (``ExplorationType.DETERMINISTIC``), the others drawn from its distribution.
+            By default a twentieth of ``num_candidates``, or 1 for a policy that is deterministic.
         **kwargs: see :class:`Planner`.
 
     Raises:
-        ValueError: if an argument is out of its range; else see :class:`Planner`.
+        ValueError: if an argument is out of its range, or a policy writes a wrong shape; else see
+            :class:`Planner`.
+        TypeError: if a policy has no distribution that can be drawn so; else see :class:`Planner`.
+        KeyError: if a policy reads or writes other entries.
 
     Examples:
         A planner of one's own is one method:
@@ -110,6 +138,10 @@ class SamplingPlanner(Planner):
         output: Literal["mean", "best"] = "mean",
         noise_beta: float = 0.0,
         keep_elites: float = 0.0,
+        carry_elites: float = 0.0,
+        population_decay: float = 1.0,
+        policy: TensorDictModuleBase | None = None,
+        num_policy_candidates: int | None = None,
         **kwargs: Any,
     ) -> None:
         check_counts(num_candidates=num_candidates)
@@ -123,20 +155,44 @@ class SamplingPlanner(Planner):
             raise ValueError(f"output must be 'mean' or 'best', got {output!r}")
         if chunk_size is not None:
             check_counts(chunk_size=chunk_size)
-        if max_ms is not None and not 0 < max_ms < math.inf:
-            raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
+        check_max_ms(max_ms)
         if not 0 <= noise_beta <= 4:
             raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
-        if not 0 <= keep_elites <= 1:
-            raise ValueError(f"keep_elites must be in [0, 1], got {keep_elites}")
-        super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        for name, fraction in (("keep_elites", keep_elites), ("carry_elites", carry_elites)):
+            if not 0 <= fraction <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {fraction}")
+        if carry_elites and not kwargs.get("warm_start", True):
+            raise ValueError(f"carry_elites must be 0 without warm_start, got {carry_elites}")
+        if not 0 < population_decay <= 1:
+            raise ValueError(f"population_decay must be in (0, 1], got {population_decay}")
+        carried = min(math.ceil(carry_elites * top_k), num_candidates - 2)
+        if carry_elites and carried < 1:
+            raise ValueError(f"num_candidates must be at least 3 to carry elites, got {num_candidates}")
+        if num_policy_candidates is not None:
+            check_counts(num_policy_candidates=num_policy_candidates)
+            if policy is None:
+                raise ValueError(
+                    f"num_policy_candidates must be None without a policy, got {num_policy_candidates}"
+                )
+        super().__init__(env, planning_horizon, optim_steps, _num_elites=max(0, carried), **kwargs)
+        self.policy: Any = policy
+        self.num_policy_candidates = 0
+        if policy is not None:
+            source = self._source
+            self.num_policy_candidates = policy_candidates(
+                source, env, self.codec, policy, num_policy_candidates, num_candidates
+            )
+            read = [] if self._env_objective is None else self._env_objective.in_keys
+            self.in_keys = list(dict.fromkeys([*self.in_keys, *read]))
         self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
-        self.noise_beta, self.keep_elites = noise_beta, keep_elites
+        self.noise_beta, self.keep_elites, self.carry_elites = noise_beta, keep_elites, carry_elites
+        self.population_decay = population_decay
         # The best plan is a candidate again anyway, so it is the next ones that are kept.
-        self._num_kept = min(int(keep_elites * top_k), top_k - 1, max(0, num_candidates - 2))
-        colour = coloured_noise_factor(planning_horizon, noise_beta) if noise_beta else None
+        self._num_free = max(0, num_candidates - self.num_policy_candidates - 2)
+        self._num_kept = min(int(keep_elites * top_k), top_k - 1, self._num_free)
+        colour = coloured_noise_factor(self.num_decisions, noise_beta) if noise_beta else None
         self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
     @abc.abstractmethod
@@ -154,12 +210,15 @@ class SamplingPlanner(Planner):
             between the floor and the spread of a cold start.
         """
 
-    def plan(self, state: Any, proposal: Proposal) -> Plan:
+    def plan(self, state: Any, proposal: Proposal, suggested: Tensor | None = None) -> Plan:
         """Plan from a state: the whole algorithm, on tensors.
 
         Args:
             state: what ``planning_state`` of the environment gives, with batch ``*B``.
             proposal: where the search starts, with batch ``*B``.
+            suggested: plans that are candidates of the first round, of shape ``(*B, E, H, A)``, ``E`` at most
+                ``num_candidates - num_policy_candidates - 2`` (those behind are left out); put inside the
+                bounds, drawn where they are not finite.
 
         Returns:
             The plan. No value leaves the device.
@@ -171,12 +230,16 @@ class SamplingPlanner(Planner):
         generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
-        clock = None if self.max_ms is None else _Clock(self.max_ms)
-        kept = None
-        for _ in range(self.optim_steps):
+        acted = self._policy_plans(state, proposal)
+        clock = Clock(self.max_ms)
+        kept = None if suggested is None else suggested[..., : self._num_free, :, :]
+        for round_ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
             generator.set_state(model_state)
-            candidates = self._candidates(proposal, best, kept)
+            num = self._population(round_) - self.num_policy_candidates
+            candidates = self._candidates(proposal, best, kept, num)
+            if acted is not None:
+                candidates = torch.cat([candidates, acted], dim=-3)
             costs = evaluate(candidates)
             elite_costs, index = costs.topk(top_k, dim=-1, largest=False)
             if constrained:
@@ -193,7 +256,7 @@ class SamplingPlanner(Planner):
             mean = torch.where(found, mean, proposal.mean)
             std = torch.where(found, std, proposal.std)
             proposal = confine(Proposal(mean, std))
-            if clock is not None and not clock.another(best_cost):
+            if not clock.another(best_cost):
                 break
         best_cost = best_cost[..., 0, 0]
         actions = codec.mode(proposal.mean) if self.output == "mean" else best
@@ -203,10 +266,22 @@ class SamplingPlanner(Planner):
             cost = evaluate(actions.unsqueeze(-3))[..., 0]
             worse = (cost >= REJECTED_COST) & (best_cost < cost)
             actions = torch.where(worse[..., None, None], best, actions)
-        return Plan(actions, proposal.std, best, best_cost)
+        carried = elites[..., : self.memory.num_elites, :, :] if self.memory.num_elites else None
+        return Plan(actions, proposal.std, best, best_cost, elites=carried)
 
-    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
-        evaluate = super()._evaluator(state, **instead)
+    def _population(self, round_: int) -> int:
+        decayed = round(self.num_candidates * self.population_decay**round_)
+        least = max(2 * self.top_k, self.num_policy_candidates + 2 + self._num_kept)
+        return min(self.num_candidates, max(decayed, least))
+
+    def _search(self, state: Any, start: Proposal, recalled: Recalled) -> Plan:
+        if recalled.elites is None:
+            return super()._search(state, start, recalled)
+        suggested = recalled.elites[..., :: self.action_repeat, :]
+        return self.plan(state, start, suggested).held(self.action_repeat)
+
+    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
+        evaluate = super()._evaluator(state)
         size, generator = self.chunk_size, self._model_generator
         if size is None:
             return evaluate
@@ -221,10 +296,22 @@ class SamplingPlanner(Planner):
 
         return in_chunks
 
-    def _candidates(self, proposal: Proposal, best: Tensor, kept: Tensor | None = None) -> Tensor:
+    def _policy_plans(self, state: Any, proposal: Proposal) -> Tensor | None:
+        """Plans ``(*B, n, H, A)`` of the policy, if there is one."""
+        if self.policy is None:
+            return None
+        mean, num = proposal.mean, self.num_policy_candidates
+        if not mean.numel():
+            return mean.unsqueeze(-3).expand(*mean.shape[:-2], num, *mean.shape[-2:])
+        expansion = expansion_from(self._source, state, self.planning_horizon, self.action_repeat)
+        return suggested_plans(expansion, self.policy, self.codec, mean, num, self._generator)
+
+    def _candidates(
+        self, proposal: Proposal, best: Tensor, kept: Tensor | None = None, num: int | None = None
+    ) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
         mean = proposal.mean
-        num = self.num_candidates
+        num = self.num_candidates if num is None else num
         drawn = (num + 1) // 2 if self.antithetic else num
         noise = torch.randn(
             (drawn, mean.shape[-2], self.family.noise_dim),
@@ -241,22 +328,9 @@ class SamplingPlanner(Planner):
             candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
-        if kept is not None:
-            candidates[..., num - self._num_kept :, :, :] = kept
+        if kept is not None and kept.shape[-3]:
+            last = candidates[..., num - kept.shape[-3] :, :, :]
+            exists = kept.isfinite().flatten(-2).all(dim=-1)[..., None, None]
+            kept = self.codec.mode(kept.clamp(self.low, self.high))
+            last.copy_(torch.where(exists, kept, last))
         return candidates
-
-
-class _Clock:
-    """Whether there is time for another round."""
-
-    def __init__(self, max_ms: float) -> None:
-        self.last = time.perf_counter()
-        self.end = self.last + 1e-3 * max_ms
-        self.longest = 0.0
-
-    def another(self, result: Tensor) -> bool:
-        """Count one round, which ends when its result is there."""
-        result.sum().item()
-        now = time.perf_counter()
-        self.longest, self.last = max(self.longest, now - self.last), now
-        return now + self.longest <= self.end

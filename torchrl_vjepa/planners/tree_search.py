@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules.mcts import MCTSScore, PUCTScore
 
-from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.discrete import DiscretePlanner
-from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State
+from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.search_tree import SearchTree
+from torchrl_vjepa.planners.source import admit_head, latent_key_of
+from torchrl_vjepa.state_heads import Head, call_head, state_value
 
 __all__ = ["TreeSearch"]
-
-Head: TypeAlias = "Callable[[Tensor], Tensor] | TensorDictModuleBase"
 
 
 class TreeSearch(DiscretePlanner):
@@ -37,7 +35,8 @@ class TreeSearch(DiscretePlanner):
     is averaged in all actions of its path. What comes behind depth ``d`` is
 
     - a **rollout** to the planning horizon by the prior policy (uniform by default), if ``leaf_value`` is
-      ``None``: each simulation is then a whole plan, with the cost that the environment's objective gives it;
+      ``None``: each simulation is then a whole plan, with the cost that the environment's objective gives it,
+      the ``terminal_value`` of where it ends included;
     - or :math:`C = -V(\hat Z_{t+d})`, a learned value, at one model step per simulation.
 
     **Scores** are those of TorchRL's modules, :class:`~torchrl.modules.mcts.PUCTScore` by default,
@@ -73,7 +72,10 @@ class TreeSearch(DiscretePlanner):
             default.
         leaf_value: latents ``(R, D)`` to values ``(R)``, expected sums of rewards (minus costs), higher is
             better; or a TensorDictModule that reads ``latent_key`` and writes ``state_value``, ``(R, 1)``. It
-            is weighted by the predicted probability of being alive.
+            is weighted by the predicted probability of being alive. Rollouts that end in a value instead take
+            ``terminal_value``.
+        max_ms: time for a plan, in milliseconds: no simulation begins that would end later, if it took as
+            long as the longest before it; the plan is that of those that ran.
         output: the plan is the principal variation of ``"visits"``, or the ``"best"`` simulation.
         return_stats: also writes ``("plan_stats", "visits")``, of the actions at the root, ``(*B, n)``, and
             ``("plan_stats", "value")``, minus the mean cost of the simulations, ``(*B, 1)``.
@@ -119,6 +121,7 @@ class TreeSearch(DiscretePlanner):
         discount: float = 1.0,
         prior_policy: Head | None = None,
         leaf_value: Head | None = None,
+        max_ms: float | None = None,
         output: Literal["visits", "best"] = "visits",
         **kwargs: Any,
     ) -> None:
@@ -127,6 +130,7 @@ class TreeSearch(DiscretePlanner):
             raise ValueError(f"exploration must be finite and not negative, got {exploration}")
         if not 0 < discount <= 1:
             raise ValueError(f"discount must be in (0, 1], got {discount}")
+        check_max_ms(max_ms)
         if output not in ("visits", "best"):
             raise ValueError(f"output must be 'visits' or 'best', got {output!r}")
         super().__init__(env, planning_horizon, num_simulations, **kwargs)
@@ -143,16 +147,17 @@ class TreeSearch(DiscretePlanner):
                 f"score must be a module of torchrl.modules.mcts that reads only {sorted(statistics)}, got "
                 f"{type(score).__name__}"
             )
-        for name, head in (("prior_policy", prior_policy), ("leaf_value", leaf_value)):
-            if head is not None and not callable(head):
-                raise TypeError(f"{name} must be callable, latents to a tensor, got {type(head).__name__}")
-            if head is not None and not (
-                isinstance(head, TensorDictModuleBase) or isinstance(env, LatentEnv)
-            ):
-                raise TypeError(
-                    f"{name} must be a TensorDictModule for {type(env).__name__}, which has no latent, got "
-                    f"{type(head).__name__}"
-                )
+        if leaf_value is not None and self.terminal_value is not None:
+            raise ValueError(
+                "at most one of leaf_value and terminal_value must be given, got both: leaf_value is used at "
+                "the horizon too"
+            )
+        logits = [] if hasattr(prior_policy, "get_dist") else ["logits"]
+        heads = {"prior_policy": (prior_policy, logits), "leaf_value": (leaf_value, ["state_value"])}
+        for name, (head, writes) in heads.items():
+            if head is not None:
+                self.in_keys = [*self.in_keys, *admit_head(self._source, env, name, head, writes)]
+        self.max_ms = max_ms
         self.num_simulations, self.exploration, self.discount = num_simulations, exploration, discount
         self.prior_policy: Any = prior_policy
         self.leaf_value: Any = leaf_value
@@ -170,7 +175,7 @@ class TreeSearch(DiscretePlanner):
             The plan. ``best`` is the cheapest simulation, whose cost contains the leaf's value.
         """
         batch = proposal.mean.shape[:-2]
-        shape = (self.num_simulations, self.planning_horizon, self.num_actions)
+        shape = (self.num_simulations, self.num_decisions, self.num_actions)
         noise = proposal.mean.new_empty(shape).exponential_(generator=self._generator).log().neg()
         if not batch.numel():
             empty = proposal.mean.new_zeros(*batch, self.num_actions)
@@ -178,12 +183,15 @@ class TreeSearch(DiscretePlanner):
             return Plan(*proposal, proposal.mean, empty[..., 0], statistics)
         index, warm = self._numbered(proposal)
         any_warm = bool(warm.any())
-        room = 1 + self.num_simulations + self.planning_horizon * any_warm
+        room = 1 + self.num_simulations + self.num_decisions * any_warm
         search = _Search(self, self._expansion(state), room)
         if any_warm:
             search.follow(index, warm)
+        clock = Clock(self.max_ms)
         for gumbel in noise:
             search.simulate(gumbel)
+            if not clock.another(search.best_cost):
+                break
         tree = search.tree
         actions, shares = tree.principal_variation()
         if self.output == "best":
@@ -213,8 +221,8 @@ class _Search:
     """One call: the trees, the states of their nodes, and the cheapest simulation so far."""
 
     def __init__(self, planner: TreeSearch, expansion: Expansion, num_nodes: int) -> None:
-        self.planner, self.expansion, self.horizon = planner, expansion, planner.planning_horizon
-        root = expansion.root
+        self.planner, self.expansion, self.horizon = planner, expansion, planner.num_decisions
+        root, self.latent_key = expansion.root, latent_key_of(planner._source)
         alive = root[ALIVE]
         self.rows = torch.arange(alive.shape[0], device=alive.device)
         self.dtype = torch.promote_types(planner.choices.dtype, alive.dtype)
@@ -279,13 +287,15 @@ class _Search:
             inside = step < self.horizon
             index = step.clamp_max(self.horizon - 1)
             action = (self._prior(state).log() + gumbel[index]).argmax(dim=-1)
-            state, after = self._step(state, paid, action, index)
-            paid = torch.where(inside, after, paid)
+            following, after = self._step(state, paid, action, index)
+            if self.planner.terminal_value is not None:  # it is that of the horizon, not of what comes after
+                following = {key: _where(inside, value, state[key]) for key, value in following.items()}
+            state, paid = following, torch.where(inside, after, paid)
             column = index.unsqueeze(1)
             drawn = torch.where(inside.unsqueeze(1), action.unsqueeze(1), plan.gather(1, column))
             plan = plan.scatter(1, column, drawn)
             step = step + 1
-        return paid, plan
+        return paid + self._leaf_cost(state, self.horizon), plan
 
     def _prior(self, state: State) -> Tensor:
         """Probabilities ``(R, n)`` of the actions; uniform where the policy gives none that are finite."""
@@ -295,11 +305,9 @@ class _Search:
         if policy is None:
             return uniform
         if hasattr(policy, "get_dist"):
-            given = policy.get_dist(self._tensordict(state)).probs
-        elif isinstance(policy, TensorDictModuleBase):
-            given = policy(self._tensordict(state)).get("logits").softmax(dim=-1)
+            given = policy.get_dist(TensorDict(entries(state), batch_size=(rows,))).probs
         else:
-            given = policy(state[planner.env.latent_key]).softmax(dim=-1)
+            given = call_head(policy, entries(state), (rows,), self.latent_key, "logits").softmax(dim=-1)
         if tuple(given.shape) != (rows, n):
             raise ValueError(
                 f"prior_policy must give one number for each of the {n} actions, of shape {(rows, n)}, got "
@@ -311,29 +319,16 @@ class _Search:
     def _leaf_cost(self, state: State, depth: int | Tensor) -> Tensor | float:
         """Discounted cost ``(R)`` of what comes behind the leaves."""
         planner, alive = self.planner, state[ALIVE]
-        head = planner.leaf_value
+        name = "terminal_value" if planner.leaf_value is None else "leaf_value"
+        head = getattr(planner, name)
         if head is None:
             return 0.0
-        if isinstance(head, TensorDictModuleBase):
-            value = head(self._tensordict(state)).get("state_value")
-            value = value.squeeze(-1) if value.ndim > alive.ndim else value
-        else:
-            value = head(state[planner.env.latent_key])
-        if value.shape != alive.shape:
-            raise ValueError(
-                f"leaf_value must give one number for each row, of shape {tuple(alive.shape)}, got "
-                f"{tuple(value.shape)}"
-            )
+        value = state_value(head, entries(state), alive.shape, self.latent_key, name=name)
         return -self._weight(depth) * (alive * value).to(self.paid.dtype)
 
     def _weight(self, step: int | Tensor) -> Tensor | float:
-        discount = self.planner.discount
+        discount = self.planner.discount**self.planner.action_repeat
         return discount**step if isinstance(step, int) else discount ** step.to(self.paid.dtype)
-
-    @staticmethod
-    def _tensordict(state: State) -> TensorDict:
-        entries = {key: value for key, value in state.items() if key != ALIVE}
-        return TensorDict(entries, batch_size=state[ALIVE].shape)
 
     def _keep(self, state: State, paid: Tensor) -> None:
         """Write a node's state and what was paid to reach it, at the next number."""
@@ -347,3 +342,8 @@ class _Search:
         better = (cost < self.best_cost) & cost.isfinite()
         self.best = torch.where(better.unsqueeze(1), plan, self.best)
         self.best_cost = torch.where(better, cost, self.best_cost)
+
+
+def _where(rows: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    """Entries of one where the rows ``(R)`` say so, else of the other."""
+    return torch.where(rows.reshape(-1, *[1] * (one.ndim - 1)), one, other)
