@@ -23,11 +23,11 @@ from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 from torchrl_vjepa.imagination import (
     PlanPrior,
-    Tasks,
     check_prior,
     first_latents,
     imagine,
     imagine_fused,
+    plan_tasks,
     read_state,
 )
 from torchrl_vjepa.latent_step import NO_GRADIENT, LatentStep
@@ -384,7 +384,8 @@ class LatentEnv(ModelBasedEnvBase):
             start, actions = self._start(state, actions, given.num_samples, generator)
             prior = prior_of.get(actions.shape[-2])
             if prior is None:
-                tasks, by_step = self._tasks(state, actions), given.fusion == "propose"
+                tasks = plan_tasks(world_model.prior, state, actions.shape[-2]) if self.task_keys else None
+                by_step = given.fusion == "propose"
                 prior = PlanPrior.of(
                     world_model.prior, tasks, self.latent_dim, actions.ndim - 3 if by_step else None,
                     whole=not by_step or world_model.termination_model is not None,
@@ -460,14 +461,6 @@ class LatentEnv(ModelBasedEnvBase):
         """How the next latent is chosen: what starts from a belief may be sampled at its start alone."""
         from_belief = self.belief_key is not None and not isinstance(state, Tensor)
         return self.how if settings.num_samples is None or from_belief else "sample"
-
-    def _tasks(self, state: Tensor | TensorDictBase, actions: Tensor) -> Tasks | None:
-        """Tasks of every step, ``(*B, 1, H or 1, *task)``: they broadcast against ``(M, *B, N, H)``."""
-        if isinstance(state, Tensor) or not self.task_keys:
-            return None
-        batch_ndim = len(state.batch_size)
-        tasks = self.world_model.prior.along(state.get("tasks"), batch_ndim, actions.shape[-2])
-        return {key: task.unsqueeze(batch_ndim) for key, task in tasks.items()}
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
         """Never: an imagined end must not trigger a reset.

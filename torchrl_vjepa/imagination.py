@@ -23,6 +23,7 @@ __all__ = [
     "first_latents",
     "imagine",
     "imagine_fused",
+    "plan_tasks",
     "read_state",
 ]
 
@@ -159,6 +160,33 @@ def drawn(belief: TensorDictBase, num_samples: int, generator: torch.Generator |
     ).unsqueeze(-1)
     particles = belief.get("particles")
     return particles.gather(-2, index.expand(*index.shape[:-1], particles.shape[-1])).movedim(-2, 0)
+
+
+def plan_tasks(prior: Prior, state: Tensor | TensorDictBase, horizon: int) -> Tasks | None:
+    """Tasks of every step of a plan.
+
+    Args:
+        prior: reads them.
+        state: what ``LatentEnv.planning_state`` gives, with batch ``*B``.
+        horizon: steps ``H``.
+
+    Returns:
+        Of shape ``(*B, 1, H or 1, *task)``, which broadcasts against ``(M, *B, N, H)``; ``None`` where the
+        state holds none.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_vjepa import GoalPrior
+        >>> state = TensorDict(tasks=TensorDict(task=torch.ones(5, 2), batch_size=[5]), batch_size=[5])
+        >>> plan_tasks(GoalPrior(std=1.0), state, 3)["task"].shape
+        torch.Size([5, 1, 1, 2])
+    """
+    if isinstance(state, Tensor):
+        return None
+    batch_ndim = len(state.batch_size)
+    tasks = prior.along(state.get("tasks"), batch_ndim, horizon)
+    return {key: task.unsqueeze(batch_ndim) for key, task in tasks.items()}
 
 
 def read_state(
