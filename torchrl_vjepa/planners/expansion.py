@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_vjepa.distributions import point_estimate
+from torchrl_vjepa.belief import PreparedTransition, rollout
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.env_objective import EnvObjective
 
@@ -85,6 +85,7 @@ class LatentExpansion:
 
     def __init__(self, env: LatentEnv, state: Tensor | TensorDictBase, horizon: int) -> None:
         self.env = env
+        self.transition = PreparedTransition(env.world_model.transition, env.rollout_dtype)
         latent = state if isinstance(state, Tensor) else state.get("latent")
         batch = latent.shape[:-1]
         latent = latent.reshape(-1, latent.shape[-1])
@@ -110,7 +111,9 @@ class LatentExpansion:
         env, model, alive = self.env, self.env.world_model, state[ALIVE]
         latent = state[env.latent_key]
         action = action.to(latent.dtype)
-        latent = point_estimate(model.transition(latent, action), env.how)
+        # A plan of one step: the short way to the point, in the environment's dtype.
+        latent = rollout(self.transition, latent, action.unsqueeze(-2), env.how).squeeze(-2)
+        latent = latent.to(alive.dtype)
         task = self._tasks_at(step, latent.ndim - 2) if self.tasks else None
         cost = model.stage_cost(latent, action, task)
         if model.termination_model is not None:
