@@ -84,10 +84,23 @@ class Hybrid(MPPI):
         return self.refine.plan(state, Proposal(found.best, found.std))
 
 
+#: Everything of Pinneri et al. (2020) at once.
+ICEM = {
+    "noise_beta": 2.0, "keep_elites": 0.3, "carry_elites": 0.3, "population_decay": 0.8, "output": "best",
+}  # fmt: skip
 VARIANTS: dict[str, tuple[type, dict[str, Any]]] = {
     "predictive sampling": (RandomShooting, {}),  # one draw around the shifted plan, its best executed
     "CEM": (CEM, {}),
+    "CEM, pink noise": (CEM, {"noise_beta": 1.0}),
+    "CEM, brown noise": (CEM, {"noise_beta": 2.0}),
+    "CEM, kept elites": (CEM, {"keep_elites": 0.3}),
+    "CEM, carried elites": (CEM, {"carry_elites": 0.3}),
+    "CEM, decaying": (CEM, {"population_decay": 0.8}),
+    "iCEM": (CEM, ICEM),
+    "iCEM, white noise": (CEM, {**ICEM, "noise_beta": 0.0}),
     "MPPI": (MPPI, {}),
+    "MPPI, pink noise": (MPPI, {"noise_beta": 1.0}),
+    "MPPI, carried elites": (MPPI, {"carry_elites": 0.3}),
     "MPPI, temperature 1": (MPPI, {"temperature": 1.0}),
     "MPPI, warm_std 0.6": (MPPI, {"warm_std": 0.6}),
     "MPPI, warm_std 0.15": (MPPI, {"warm_std": 0.15}),
@@ -114,7 +127,10 @@ def contenders() -> Iterator[Contender]:
             ) -> Planner:  # fmt: skip
                 return cls(env, *size, seed=0, **kwargs)
 
-            arithmetic = horizon * candidates * rounds
+            decay = kwargs.get("population_decay", 1.0)
+            least = min(candidates, 2 * (candidates // 8))  # twice the elites
+            drawn = [max(round(candidates * decay**k), least) for k in range(rounds)]
+            arithmetic = horizon * sum(drawn)
             yield Contender(name, horizon, candidates, rounds, make, arithmetic)
             if name == "MPPI":
                 yield Contender("MPPI, bf16", horizon, candidates, rounds, make, arithmetic, torch.bfloat16)
@@ -235,9 +251,9 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> None:
     from matplotlib import pyplot as plt
 
     fig, ax = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    shown = ("predictive sampling", "CEM", "MPPI", "MPPI, cold", "gradient", "hybrid")
-    colors = ("#999999", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00")
-    marks = "osD^vX"
+    shown = ("predictive sampling", "CEM", "iCEM", "MPPI", "MPPI, cold", "gradient", "hybrid")
+    colors = ("#999999", "#E69F00", "#CC79A7", "#0072B2", "#56B4E9", "#009E73", "#D55E00")
+    marks = "osPD^vX"
     for name, color, mark in zip(shown, colors, marks, strict=True):
         here = sorted((r for r in summary(rows) if r["planner"] == name), key=lambda r: r["arithmetic"])
         excess = [max(r["mean"] - 1, 1e-3) for r in here]

@@ -7,8 +7,8 @@ must give the very plan of the library, TorchRL's planners the same optimum. "pr
 products of a plan alone. With "one by one", environments are planned for one after another; "chunked"
 imagines a quarter of the candidates at a time, "bf16" has LatentEnv(rollout_dtype=torch.bfloat16), "short"
 three quarters of the iterations besides (see planner_quality.py for what that costs), "compiled" the default
-torch.compile; all against the full floor. pytorch_mppi joins where it is installed (pip install
-pytorch_mppi; it is no dependency), for one environment.
+torch.compile; all against the full floor. pytorch_mppi joins where it is installed (the extra "benchmarks"),
+over the network and the cost of the floor.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from typing import Any
 
 import matplotlib as mpl
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -61,6 +62,8 @@ PLANNERS = (
     "products",
 )
 BOUND, EFFORT = 2.0, 0.1
+#: Of pytorch_mppi, in units of the cost: small enough to find the optimum in the check below.
+PEER_TEMPERATURE = 0.05
 #: Multiplications of one plan beyond which a combination is left out: minutes, and nothing new.
 MAX_PRODUCTS = 2.5e11
 #: Iterations after which plans of different planners are compared: the optimum, not how soon it is reached.
@@ -176,24 +179,42 @@ class Problem:
             return CEMPlanner(self.env, **given)
         return MPPIPlanner(self.env, SummedReward(), temperature=1.0, **given)
 
-    def pytorch_mppi(self) -> Call:
-        """The planner of pytorch_mppi: one command for every iteration, the plan kept in between."""
+    def pytorch_mppi(self, optim_steps: int | None = None) -> Call:
+        """The planner of pytorch_mppi: one command for every iteration, the plan kept in between.
+
+        Its network and cost are the bare ones of the floor: what is measured is the planner. Its spread stays
+        what it is, and its temperature is in units of the cost.
+        """
         module = importlib.import_module("pytorch_mppi")
-        planner = module.MPPI(
-            lambda state, action: self.predictor.dist(state, action).mean,
-            lambda state, action: self.env.world_model.stage_cost(state, action),
-            self.start.shape[1],
-            torch.eye(self.action) * (0.5 * BOUND) ** 2,
-            num_samples=self.candidates,
-            horizon=self.horizon,
-            u_min=torch.full((self.action,), -BOUND),
-            u_max=torch.full((self.action,), BOUND),
-        )
+        floor = self.floor("mppi")
+        (w1, b1), (w2, b2), (w3, b3) = floor.layers
+
+        def dynamics(state: Tensor, action: Tensor) -> Tensor:
+            hidden = F.silu(F.linear(torch.cat([state, action], -1), w1, b1), inplace=True)
+            return F.linear(F.silu(F.linear(hidden, w2, b2), inplace=True), w3, b3)
+
+        def cost(state: Tensor, action: Tensor) -> Tensor:
+            return (state - self.goal).square().sum(-1) + EFFORT * action.square().sum(-1)
+
+        spread = torch.eye(self.action) * (0.5 * BOUND) ** 2
+        given = {
+            "num_samples": self.candidates,
+            "horizon": self.horizon,
+            "lambda_": PEER_TEMPERATURE,
+            "u_min": torch.full((self.action,), -BOUND),
+            "u_max": torch.full((self.action,), BOUND),
+        }
+        latent = self.start.shape[1]
+        if self.num_envs == 1:
+            planner = module.MPPI(dynamics, cost, latent, spread, **given)
+        else:
+            planner = module.MPPI_Batched(dynamics, cost, latent, spread, self.num_envs, **given)
+        start = self.start[0] if self.num_envs == 1 else self.start
 
         def call() -> Tensor:
             planner.reset()
-            for _ in range(self.optim_steps):
-                action = planner.command(self.start[0], shift_nominal_trajectory=False)
+            for _ in range(optim_steps or self.optim_steps):
+                action = planner.command(start, shift_nominal_trajectory=False)
             return action
 
         return call
@@ -219,8 +240,7 @@ class Problem:
             stock = self.theirs(name)
             return lambda: stock(self.data())
         if name == "pytorch_mppi":
-            usable = self.num_envs == 1 and importlib.util.find_spec(name) is not None
-            return self.pytorch_mppi() if usable else None
+            return self.pytorch_mppi() if importlib.util.find_spec(name) is not None else None
         floor = self.floor("mppi" if name == "floor MPPI" else "cem")
         if name == "products":
             return lambda: floor.products(self.start, self.inputs)
@@ -262,6 +282,10 @@ def check_optimum(size: str, seed: int) -> None:
         torch.manual_seed(seed)
         action = planner(problem.data())["action"]
         reached[name] = problem.env.objective(problem.start, action[:, None, None, :]).squeeze(1)
+    if importlib.util.find_spec("pytorch_mppi") is not None:
+        torch.manual_seed(seed)
+        action = problem.pytorch_mppi()()
+        reached["pytorch_mppi"] = problem.env.objective(problem.start, action[:, None, None, :]).squeeze(1)
     for name, cost in reached.items():
         torch.testing.assert_close(
             cost, reached["CEM"], rtol=2e-2, atol=1e-3, msg=lambda m, n=name: f"{n}: {m}"
@@ -377,7 +401,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if left_out:
         print(f"left out, more than {MAX_PRODUCTS:.1g} multiplications a plan: {', '.join(left_out)}")
     if importlib.util.find_spec("pytorch_mppi") is None:
-        print("pytorch_mppi is not installed: not measured")
+        print('pytorch_mppi is not installed (the extra "benchmarks"): not measured')
     draw(rows, args.out)
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)

@@ -313,10 +313,11 @@ class TestPlanning:
         planner = CEM(env, 2, 1, 1, seed=0)
         td = TensorDict(latent=torch.ones(2, 1), plan=torch.zeros(2, 2, 3), batch_size=2)
         td["is_init"] = torch.tensor([[False], [True]])
-        start = planner._start(td, td.batch_size)
+        start = planner._start(planner.memory.recall(td, td.batch_size, planner.low), td.batch_size)
         torch.testing.assert_close(start.mean[0], torch.full((2, 3), 0.15))
         torch.testing.assert_close(start.mean[1], torch.full((2, 3), 0.5))
-        start = planner._start(td.exclude("is_init"), td.batch_size)  # who knows: it may be a reset
+        recalled = planner.memory.recall(td.exclude("is_init"), td.batch_size, planner.low)
+        start = planner._start(recalled, td.batch_size)  # who knows: it may be a reset
         torch.testing.assert_close(start.mean, torch.full((2, 2, 3), 0.5))
 
     def test_gradient_planning_refuses_choices_and_takes_several_numbers(self) -> None:

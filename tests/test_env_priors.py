@@ -321,7 +321,7 @@ class TestPosterior:
             env, horizon, 1, 20_000, 20_000, temperature=1.0, normalize_costs=False, init_std=init_std,
             warm_start=False, num_samples=64, fusion=fusion, seed=0,
         )  # fmt: skip
-        plan = planner.plan(self.latent, planner._start(TensorDict(), torch.Size([])))
+        plan = planner.plan(self.latent, planner.family.cold((), planner.num_decisions))
         zero = torch.zeros(horizon, 1, dtype=torch.float64)
         base = joint(self.latent, zero)
         columns = [joint(self.latent, zero.index_fill(0, torch.tensor([k]), 1.0)).mean - base.mean
@@ -337,7 +337,7 @@ class TestPosterior:
     def test_cem_finds_the_most_probable_plan(self, fusion: Any) -> None:
         env = make_env(Well().bind(self.goal))
         planner = CEM(env, 2, 12, 256, 32, num_samples=128, fusion=fusion, min_std=1e-3, seed=0)
-        plan = planner.plan(self.latent, planner._start(TensorDict(), torch.Size([])))
+        plan = planner.plan(self.latent, planner.family.cold((), planner.num_decisions))
         actions = plan.actions.clone().requires_grad_()
 
         # The gradient of the exact objective vanishes where it is least; a Newton step says how far that is.

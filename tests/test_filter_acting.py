@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torch.distributions import Distribution, Independent, LogNormal
 from torchrl.collectors import Collector
-from torchrl.data import Bounded
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, TensorSpec
 from torchrl.envs import (
     ActionScaling,
     EnvBase,
@@ -26,6 +26,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule, CEMPlanner, get_env_transforms_from_module
 
+from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.belief import LinearObservation, ParticleBelief, ParticleFilter, PseudoLikelihood
 from torchrl_vjepa.costs import quadratic_cost
 from torchrl_vjepa.distributions import Delta, diag_gaussian
@@ -193,7 +194,7 @@ def test_a_policy_pickles_with_its_transforms() -> None:
     torch.testing.assert_close(one["action"], other["action"])
     primer = make_policy()[1].make_tensordict_primer()
     again = pickle.loads(pickle.dumps(primer))
-    assert again.executed_key == "action"
+    assert again.executed_keys == ["action"]
     assert len(list(others)) == len(list(transforms))
 
 
@@ -232,7 +233,7 @@ def test_keys_can_be_renamed() -> None:
     assert out["next", "agent", "b", "particles"].shape == (2, K, D)
     assert out["belief_stats", "log_evidence"].shape == (2,)
     assert (out["belief_stats", "effective_sample_size"] > 1).all()
-    assert run.make_tensordict_primer().executed_key == ("agent", "u")
+    assert run.make_tensordict_primer().executed_keys == [("agent", "u")]
 
 
 def test_rows_start_by_themselves() -> None:
@@ -431,3 +432,49 @@ def test_bad_beliefs_are_refused() -> None:
     state = TensorDict(particles=torch.zeros(3, 4, 1), log_weights=torch.zeros(3, 4), batch_size=[3])
     with pytest.raises(ValueError, match="state and actions must have shapes"):
         env.objective(state, torch.zeros(2, 5, 1, 1))
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        OneHot(3),
+        Categorical(3),
+        MultiCategorical([2, 3]),
+        Composite(gear=Categorical(2), deep=Composite(wheel=Bounded(-1, 1, (2,)))),
+    ],
+)
+def test_actions_of_any_kind_are_carried_in_code(spec: TensorSpec) -> None:
+    codec = ActionCodec(spec)
+    model = VJEPA(linear_encoder(3, D), Predictor(D, action_dim=codec.size))
+    run = make_filter(model, action_spec=spec)
+    primer = run.make_tensordict_primer()
+    actions = codec.decode(torch.randn(2, codec.size))
+    td = actions.clone()
+    td["belief"] = TensorDict(action=torch.zeros(2, codec.size), batch_size=[2])
+    td["belief", "particles"], td["belief", "log_weights"] = torch.zeros(2, K, D), torch.zeros(2, K)
+    executed = primer._inv_call(td)["belief", "action"]
+    torch.testing.assert_close(executed, codec.encode(actions))
+    belief = TensorDict(td["belief"], batch_size=[2])
+    init = torch.zeros(2, 1).bool()
+    after = run(TensorDict(latent=torch.zeros(2, D), belief=belief, is_init=init, batch_size=[2]))
+    assert after["belief_mean"].isfinite().all()
+
+
+def test_a_discrete_environment_is_filtered_and_planned_in() -> None:
+    spec = Categorical(2)
+    model = VJEPA(linear_encoder(4, D), Predictor(D, action_dim=2))
+    run = make_filter(model, action_spec=spec)
+    cost = quadratic_cost(torch.zeros(D))
+    world = LatentEnv(model, action_spec=spec, cost=cost, belief_key=BELIEF)
+    policy = TensorDictSequential(model.encoder, run, CEM(world, 3, 2, 16))
+    env = GymEnv("CartPole-v1", categorical_action_encoding=True)
+    env = TransformedEnv(env, get_env_transforms_from_module(policy))
+    data = env.rollout(4, policy, break_when_any_done=False)
+    codec = ActionCodec(spec)
+    torch.testing.assert_close(data["belief", "action"][1:], codec.encode(data["action"])[:-1])
+
+
+def test_a_specification_of_another_size_is_refused() -> None:
+    model = VJEPA(linear_encoder(3, D), Predictor(D, action_dim=1))
+    with pytest.raises(ValueError, match="action_spec must be of action_dim=1 numbers, got 3 of index"):
+        make_filter(model, action_spec=Categorical(3))

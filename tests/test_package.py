@@ -44,7 +44,7 @@ def test_torch_is_pinned_first(pins: dict[str, str]) -> None:
 def test_every_dependency_is_pinned(pyproject: dict[str, Any], pins: dict[str, str]) -> None:
     project = pyproject["project"]
     extras = project["optional-dependencies"]
-    for requirement in [*project["dependencies"], *extras["examples"], *extras["test"]]:
+    for requirement in [*project["dependencies"], *(name for extra in extras.values() for name in extra)]:
         name = canonical(re.split(r"[<>=!~; \[]", requirement)[0])
         assert name in pins, f"{name} has no version in constraints.txt"
 

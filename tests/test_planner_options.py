@@ -115,8 +115,8 @@ class _Spy(CEM):
         self.seen: list[Tensor] = []
         self.elites: list[Tensor] = []
 
-    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
-        evaluate = super()._evaluator(state, **instead)
+    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
+        evaluate = super()._evaluator(state)
 
         def spied(candidates: Tensor) -> Tensor:
             self.seen.append(candidates.clone())

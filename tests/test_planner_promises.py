@@ -14,14 +14,52 @@ from hypothesis import strategies as st
 from specs import specs
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical, OneHot, TensorSpec
 
+from _memory import peak
 from torchrl_vjepa.distributions import Delta, diag_gaussian
 from torchrl_vjepa.envs import LatentEnv
-from torchrl_vjepa.planners import CEM, MPPI, GradientMPC, Planner, RandomShooting
+from torchrl_vjepa.planners import (
+    CEM,
+    MPPI,
+    ExhaustiveSearch,
+    GradientMPC,
+    Planner,
+    RandomShooting,
+    SamplingPlanner,
+    TreeSearch,
+)
 
 SAMPLING = [RandomShooting, CEM, MPPI]
+TREES = [ExhaustiveSearch, TreeSearch]
 planners = st.sampled_from(SAMPLING)
+
+
+def few_choices() -> st.SearchStrategy[TensorSpec]:
+    """Specifications of which a tree has few branches."""
+    leaf = st.sampled_from([OneHot(3), Categorical(2), MultiCategorical([2, 3]), Binary(2), Categorical(1)])
+    return st.one_of(leaf, st.builds(lambda a, b: Composite(left=a, deep=Composite(right=b)), leaf, leaf))
+
+
+def families() -> st.SearchStrategy[tuple[type[Planner], TensorSpec]]:
+    """Every planner with a specification that it takes."""
+    return st.one_of(
+        st.tuples(planners, specs()),
+        st.tuples(planners, specs()),
+        st.tuples(st.sampled_from(TREES), few_choices()),
+    )
+
+
+#: What changes how candidates are drawn, held and remembered.
+options = st.fixed_dictionaries(
+    {
+        "noise_beta": st.sampled_from([0.0, 2.0]),
+        "keep_elites": st.sampled_from([0.0, 0.5]),
+        "carry_elites": st.sampled_from([0.0, 0.5]),
+        "population_decay": st.sampled_from([1.0, 0.5]),
+        "action_repeat": st.sampled_from([1, 2]),
+    }
+)
 
 
 def drift(latent: Tensor, action: Tensor) -> Delta:
@@ -80,8 +118,15 @@ def make_planner(
         **how,
     )
     horizon = kwargs.pop("horizon", 2)
-    settings = {"optim_steps": 3, "num_candidates": 12, "top_k": 4, "init_std": 0.5, "seed": 0}
-    return cls(env, horizon, **{**settings, **kwargs})
+    settings = {"optim_steps": 3, "num_candidates": 12, "top_k": 4, "init_std": 0.5}
+    if not issubclass(cls, SamplingPlanner):
+        settings = {"num_simulations": 12} if cls is TreeSearch else {"warm_start": True}
+        kwargs = {name: kwargs[name] for name in ("action_repeat", "return_stats") if name in kwargs}
+    return cls(env, horizon, **{**settings, "seed": 0, **kwargs})
+
+
+def is_sampled(cls: type[Planner], sampled: bool) -> bool:
+    return sampled and cls is not TreeSearch
 
 
 def states(*batch: int, seed: int = 0) -> TensorDict:
@@ -103,34 +148,37 @@ def assert_same(one: TensorDict, two: TensorDict) -> None:
         torch.testing.assert_close(value, two[key])
 
 
-@settings(max_examples=60)
+@settings(max_examples=80)
 @given(
-    cls=planners,
-    spec=specs(),
+    family=families(),
     value=st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -1e30, 0.0, 1e308]),
     everywhere=st.booleans(),
     batch=st.sampled_from([(), (3,), (2, 1), (0,)]),
-    horizon=st.integers(1, 4),
-    num=st.integers(1, 9),
+    decisions=st.integers(1, 3),
+    num=st.integers(3, 9),
     output=st.sampled_from(["mean", "best"]),
     sampled=st.booleans(),
+    given=options,
 )
 def test_actions_are_finite_and_inside_whatever_the_cost_returns(
-    cls: type[Planner],
-    spec: TensorSpec,
+    family: tuple[type[Planner], TensorSpec],
     value: float,
     everywhere: bool,
     batch: tuple[int, ...],
-    horizon: int,
+    decisions: int,
     num: int,
     output: str,
     sampled: bool,
+    given: dict[str, Any],
 ) -> None:
+    cls, spec = family
     kwargs = {} if cls is RandomShooting else {"output": output}
-    model = drift_with_noise if sampled else drift
+    model = drift_with_noise if is_sampled(cls, sampled) else drift
     cost = Spoilt(value, everywhere)
-    sizes = {"horizon": horizon, "num_candidates": num, "top_k": max(1, num // 2)}
-    planner = make_planner(cls, spec, cost, model=model, return_stats=True, **sizes, **kwargs)
+    # Statistics of a tree are those of a search in every step.
+    stats = not (cls is TreeSearch and given["action_repeat"] > 1)
+    sizes = {"horizon": decisions * given["action_repeat"], "num_candidates": num, "top_k": max(1, num // 2)}
+    planner = make_planner(cls, spec, cost, model=model, return_stats=stats, **sizes, **given, **kwargs)
     td = states(*batch)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -141,23 +189,31 @@ def test_actions_are_finite_and_inside_whatever_the_cost_returns(
             for row in actions(planner, td).reshape(-1):
                 assert full(spec).is_in(row)
             codes = planner.codec.size
-            for key in (("plan_stats", "actions"), ("plan_stats", "std"), ("next", "plan")):
+            if stats:
+                assert td["plan_stats", "std"].isfinite().all()
+            plans = [("plan_stats", "actions")] * stats
+            for key in [
+                *plans,
+                *(("next", key) for part, key in planner.memory.keys.items() if part != "age"),
+            ]:
                 rows = td[key].reshape(-1, codes)
                 assert rows.isfinite().all()
-            for plan in (td["plan_stats", "actions"], td["next", "plan"]):
-                for row in planner.codec.decode(plan.reshape(-1, codes)):
+                for row in planner.codec.decode(rows):
                     assert full(spec).is_in(row)
-            td["plan"] = td["next", "plan"]
+            td.update(td["next"])
 
 
 @settings(max_examples=40)
-@given(cls=planners, spec=specs(), sampled=st.booleans(), split=st.integers(1, 15))
+@given(family=families(), sampled=st.booleans(), split=st.integers(1, 15), given=options)
 def test_any_split_of_a_batch_gives_the_same_plans(
-    cls: type[Planner], spec: TensorSpec, sampled: bool, split: int
+    family: tuple[type[Planner], TensorSpec], sampled: bool, split: int, given: dict[str, Any]
 ) -> None:
-    model = drift_with_noise if sampled else drift
-    planner = make_planner(cls, spec, model=model, num_candidates=20)
+    cls, spec = family
+    model = drift_with_noise if is_sampled(cls, sampled) else drift
+    planner = make_planner(cls, spec, model=model, num_candidates=20, **given)
     td = states(16)
+    td = states(16, seed=1).update(planner(td)["next"])
+    planner.set_seed(0)
     together = planner(td.clone())
     parts = []
     for part in td.split([split, 16 - split]):
@@ -172,28 +228,31 @@ def test_any_split_of_a_batch_gives_the_same_plans(
 
 
 @settings(max_examples=30)
-@given(cls=planners, spec=specs(), order=st.permutations(range(6)))
+@given(family=families(), order=st.permutations(range(6)), given=options)
 def test_permuting_environments_permutes_plans(
-    cls: type[Planner], spec: TensorSpec, order: list[int]
+    family: tuple[type[Planner], TensorSpec], order: list[int], given: dict[str, Any]
 ) -> None:
-    planner = make_planner(cls, spec)
-    expected = planner(states(6))
+    planner = make_planner(*family, **given)
+    td = states(6, seed=1).update(planner(states(6))["next"])
     planner.set_seed(0)
-    permuted = planner(states(6)[order])
+    expected = planner(td.clone())
+    planner.set_seed(0)
+    permuted = planner(td[order])
     for key in planner.out_keys:
         torch.testing.assert_close(permuted[key], expected[key][order])
 
 
 @settings(max_examples=30)
-@given(cls=planners, spec=specs(), num=st.integers(1, 9), sampled=st.booleans())
+@given(cls=planners, spec=specs(), num=st.integers(3, 9), sampled=st.booleans(), given=options)
 def test_more_rounds_never_worsen_the_best_plan(
-    cls: type[Planner], spec: TensorSpec, num: int, sampled: bool
+    cls: type[Planner], spec: TensorSpec, num: int, sampled: bool, given: dict[str, Any]
 ) -> None:
     model = drift_with_noise if sampled else drift
     last = torch.full((5,), math.inf, dtype=torch.float64)
+    sizes = {"num_candidates": num, "top_k": 1}
     for steps in range(1, 6):
-        planner = make_planner(cls, spec, model=model, optim_steps=steps, num_candidates=num, top_k=1)
-        start = planner.family.cold((5,), 2)
+        planner = make_planner(cls, spec, model=model, optim_steps=steps, **sizes, **given)
+        start = planner.family.cold((5,), planner.num_decisions)
         found = planner.plan(states(5)["latent"], start)
         assert (found.best_cost <= last).all()
         last = found.best_cost
@@ -227,11 +286,12 @@ def test_they_change_mppi_through_its_temperature_alone(spec: TensorSpec, power:
 
 
 @settings(max_examples=30)
-@given(cls=planners, spec=specs(), row=st.integers(0, 4))
-def test_the_reset_of_one_row_changes_no_other(cls: type[Planner], spec: TensorSpec, row: int) -> None:
-    planner = make_planner(cls, spec)
-    first = planner(states(5))
-    td = states(5, seed=1).set("plan", first["next", "plan"])
+@given(family=families(), row=st.integers(0, 4), given=options)
+def test_the_reset_of_one_row_changes_no_other(
+    family: tuple[type[Planner], TensorSpec], row: int, given: dict[str, Any]
+) -> None:
+    planner = make_planner(*family, **given)
+    td = states(5, seed=1).update(planner(states(5))["next"])
     td["is_init"] = torch.zeros(5, 1).bool()
     state = planner.generator.get_state(), planner._model_generator.get_state()
     running = planner(td.clone())
@@ -244,7 +304,7 @@ def test_the_reset_of_one_row_changes_no_other(cls: type[Planner], spec: TensorS
         torch.testing.assert_close(reset[key][others], running[key][others])
     planner.generator.set_state(state[0])
     planner._model_generator.set_state(state[1])
-    new = planner(td.exclude("plan", "is_init"))
+    new = planner(td.select("latent"))
     for key in planner.out_keys:
         torch.testing.assert_close(reset[key][row], new[key][row])
 
@@ -267,6 +327,29 @@ def test_a_warm_start_from_a_perfect_plan_keeps_it(cls: type[Planner], spec: Ten
         td["plan"] = out["next", "plan"]
 
 
+@settings(max_examples=25)
+@given(
+    cls=planners,
+    spec=specs(),
+    num=st.integers(20, 300),
+    chunk=st.integers(2, 20),
+    batch=st.integers(1, 4),
+    sampled=st.booleans(),
+)
+def test_memory_stays_under_its_bound(
+    cls: type[Planner], spec: TensorSpec, num: int, chunk: int, batch: int, sampled: bool
+) -> None:
+    """As ``chunk_size`` says: that of a plan of so many candidates, and ten times the candidates."""
+    model = drift_with_noise if sampled else drift
+    given = {"model": model, "horizon": 5, "top_k": 2}
+    bounded = make_planner(cls, spec, num_candidates=num, chunk_size=chunk, **given)
+    small = make_planner(cls, spec, num_candidates=chunk, **given)
+    codec = bounded.codec
+    candidates = batch * num * 5 * codec.size * codec.dtype.itemsize
+    td = states(batch)
+    assert peak(lambda: bounded(td.clone())) <= peak(lambda: small(td.clone())) + 10 * candidates
+
+
 class Network(nn.Module):
     """With everything that a careless call would change."""
 
@@ -279,19 +362,23 @@ class Network(nn.Module):
         return Delta(self.layers(rows.flatten(0, -2)).reshape(latent.shape))
 
 
-@pytest.mark.parametrize("cls", [*SAMPLING, GradientMPC])
-@pytest.mark.parametrize("spec", [Bounded(-1, 1, (2,)), Categorical(2)])
+@pytest.mark.parametrize(
+    ("cls", "spec"),
+    [
+        *((cls, Bounded(-1, 1, (2,))) for cls in (*SAMPLING, GradientMPC)),
+        *((cls, Categorical(2)) for cls in (*SAMPLING, *TREES)),
+    ],
+)
 @pytest.mark.parametrize("training", [False, True])
 def test_planners_touch_nothing(cls: type[Planner], spec: TensorSpec, training: bool) -> None:
-    if cls is GradientMPC and isinstance(spec, Categorical):
-        pytest.skip("refused")
     model = Network(2)
     env = LatentEnv(model, action_spec=spec, cost=Grid(), latent_dim=1)
     model.layers.train(training)
     model.layers[1].eval()  # statistics in training mode are the model's own affair
     model.layers[2].eval()  # and so is the global random state behind a dropout
     model.layers[0].weight.grad = torch.full_like(model.layers[0].weight, 3.0)
-    planner = cls(env, 3, 2, seed=0, return_stats=True)
+    steps = {} if cls in TREES else {"optim_steps": 2}
+    planner = cls(env, 3, **steps, seed=0, return_stats=True)
     before = copy.deepcopy(dict(model.named_parameters())), copy.deepcopy(dict(model.named_buffers()))
     modes = [module.training for module in planner.modules()]
     random = torch.get_rng_state()

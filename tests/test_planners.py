@@ -795,7 +795,7 @@ class TestWarmStart:
     def test_spread_is_smaller_and_the_plan_is_put_inside_the_bounds(self) -> None:
         planner = CEM(lqr_env(), 4, warm_std=0.25)
         td = states(2).set("plan", torch.full((2, 4, 2), 9.0))
-        start = planner._start(td, torch.Size([2]))
+        start = planner._start(planner.memory.recall(td, torch.Size([2]), planner.low), torch.Size([2]))
         assert (start.mean == 3.0).all()
         torch.testing.assert_close(start.std, torch.full((2, 4, 2), 0.25 * 0.5 * 3))
 

@@ -12,14 +12,12 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.distributions import Distribution
-from torchrl.data import Composite, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
-from torchrl_vjepa.belief.particles import (
-    ParticleBelief,
-    effective_sample_size,
-    resampling_index,
-)
+from torchrl_vjepa.actions import ActionCodec
+from torchrl_vjepa.belief.particles import ParticleBelief, effective_sample_size, resampling_index
+from torchrl_vjepa.belief.primer import BeliefPrimer
 from torchrl_vjepa.distributions import diag_gaussian, sample
 from torchrl_vjepa.generators import pack_generator, unpack_generator
 
@@ -81,6 +79,8 @@ class ParticleFilter(TensorDictModuleBase):
             bound on the memory of what they compute on the way.
         latent_dim: size ``D``; needed only if the model does not tell.
         action_dim: size ``A`` of the flattened action; needed only if the model does not tell.
+        action_spec: of the environment (``env.full_action_spec_unbatched``), for actions that models read in
+            the code of :class:`~torchrl_vjepa.actions.ActionCodec`: choices, bits, several tensors.
         observation_ndim: number of dimensions of one observation: 1 for vectors, 3 for images.
         return_stats: also write ``("belief_stats", "log_evidence")`` and
             ``("belief_stats", "effective_sample_size")``, of shape ``(*B)``.
@@ -146,6 +146,7 @@ class ParticleFilter(TensorDictModuleBase):
         chunk_size: int | None = None,
         latent_dim: int | None = None,
         action_dim: int | None = None,
+        action_spec: TensorSpec | None = None,
         observation_ndim: int = 1,
         return_stats: bool = False,
         observation_key: NestedKey = "observation",
@@ -167,6 +168,13 @@ class ParticleFilter(TensorDictModuleBase):
         action_dim = getattr(predictor, "action_dim", None) if action_dim is None else action_dim
         if action_key is None:
             action_key = getattr(predictor, "action_key", "action")
+        codec = None if action_spec is None else ActionCodec(action_spec, action_key)
+        if codec is not None and action_dim not in (None, codec.size):
+            raise ValueError(
+                f"action_spec must be of action_dim={action_dim} numbers, got {codec.size} of "
+                f"{codec.describe()}"
+            )
+        action_dim = action_dim if codec is None else codec.size
         for name, value, least in (
             ("num_particles", num_particles, 1),
             ("chunk_size", num_particles if chunk_size is None else chunk_size, 1),
@@ -184,6 +192,7 @@ class ParticleFilter(TensorDictModuleBase):
         self.num_particles, self.chunk_size = num_particles, chunk_size
         self.initial, self.proposal = initial, proposal
         self.resample_threshold = float(resample_threshold)
+        self.codec = codec
         self.latent_dim, self.action_dim = int(latent_dim or 0), int(action_dim or 0)
         self.observation_ndim, self.return_stats = observation_ndim, return_stats
         self.generator = generator
@@ -239,7 +248,7 @@ class ParticleFilter(TensorDictModuleBase):
 
         Args:
             belief: the one before, with batch ``*B``.
-            action: the executed action :math:`u_t`, of shape ``(*B, A)``.
+            action: the executed action :math:`u_t`, in code, of shape ``(*B, A)``.
             observation: :math:`x_{t+1}`, of shape ``(*B, *O)``.
 
         Returns:
@@ -362,7 +371,8 @@ class ParticleFilter(TensorDictModuleBase):
         primers = Composite()
         for key, shape in zip(self.in_keys[1:4], shapes, strict=True):
             primers[key] = Unbounded(shape, device=device, dtype=self.dtype)
-        return _BeliefPrimer(primers, self.action_key, self.in_keys[3])
+        action = self.action_key if self.codec is None else self.codec
+        return BeliefPrimer(primers, action, self.in_keys[3])
 
     def _advance(
         self,
@@ -494,21 +504,3 @@ class ParticleFilter(TensorDictModuleBase):
         packed = state["generator"]
         generator = None if packed is None else unpack_generator(packed)
         super().__setstate__({**state, "generator": generator})
-
-
-class _BeliefPrimer(TensorDictPrimer):
-    """Zeros at a reset; besides, writes down the action with which the environment is stepped."""
-
-    def __init__(self, primers: Composite, action_key: NestedKey, memory_key: NestedKey) -> None:
-        super().__init__(primers, expand_specs=True)
-        self.executed_key, self.memory_key = action_key, memory_key
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # Called before the action reaches the transforms below: it is the one of the data. What is
-        # under memory_key here is what TensorDictPrimer carries on to the next step.
-        tensordict = super()._inv_call(tensordict)
-        action = tensordict.get(self.executed_key, None)
-        if action is not None:
-            before = tensordict.get(self.memory_key)
-            tensordict.set(self.memory_key, action.reshape(before.shape).to(before.dtype))
-        return tensordict

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
-from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import MPCPlannerBase
@@ -18,7 +17,8 @@ from torchrl.modules import MPCPlannerBase
 from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.generators import offspring, pack_generator, unpack_generator
 from torchrl_vjepa.planners.env_objective import EnvObjective
-from torchrl_vjepa.planners.plan import Plan, check_counts, remembered, warn_of_costs
+from torchrl_vjepa.planners.memory import PlanMemory, Recalled
+from torchrl_vjepa.planners.plan import Plan, check_counts, warn_of_costs
 from torchrl_vjepa.planners.proposal import Proposal, ProposalFamily
 from torchrl_vjepa.risk import ChanceConstraint, Risk
 
@@ -81,9 +81,12 @@ class Planner(MPCPlannerBase):
             actions, the probability with which a choice is drawn anew.
         init_std: spread of the proposal after a cold start: a fraction of half the range where the
             action is bounded (0.5 by default), in units of the action where it is not (no default).
-        replan_interval: steps of a plan that are executed before the next search; needs ``warm_start``. How
-            many were is counted in the tensordict, under ``plan_key`` with ``_age`` appended, for each row:
-            the search is left out where no row needs it.
+        replan_interval: steps of a plan that are executed before the next search, a multiple of
+            ``action_repeat`` and that by default; more than one needs ``warm_start``. How many were is
+            counted in the tensordict, under ``plan_key`` with ``_age`` appended, for each row: the search is
+            left out where no row needs it.
+        action_repeat: steps for which every action of a plan is held, imagined and executed;
+            ``planning_horizon`` is a multiple of it. So ``H / action_repeat`` decisions are searched.
         num_samples: trajectories ``M`` imagined for each plan; the environment's way by default.
         risk: ``(costs (M, *B)) -> (*B)`` of their costs, for instance
             :func:`~torchrl_vjepa.risk.cvar`; the environment's by default.
@@ -151,7 +154,8 @@ class Planner(MPCPlannerBase):
         warm_start: bool = True,
         warm_std: float = 0.3,
         init_std: float | None = None,
-        replan_interval: int = 1,
+        replan_interval: int | None = None,
+        action_repeat: int = 1,
         num_samples: int | None = None,
         risk: Risk | None = None,
         constraints: Sequence[ChanceConstraint] | None = None,
@@ -160,15 +164,23 @@ class Planner(MPCPlannerBase):
         return_stats: bool | Mapping[str, Risk] = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
+        _num_elites: int = 0,
         seed: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         check_counts(planning_horizon=planning_horizon, optim_steps=optim_steps)
-        check_counts(replan_interval=replan_interval)
-        if replan_interval > (planning_horizon if warm_start else 1):
+        check_counts(action_repeat=action_repeat)
+        if planning_horizon % action_repeat:
             raise ValueError(
-                f"replan_interval must be at most planning_horizon={planning_horizon}, and 1 without "
-                f"warm_start, got {replan_interval}"
+                f"planning_horizon must be a multiple of action_repeat={action_repeat}, "
+                f"got {planning_horizon}"
+            )
+        replan_interval = action_repeat if replan_interval is None else replan_interval
+        check_counts(replan_interval=replan_interval)
+        if replan_interval > (planning_horizon if warm_start else 1) or replan_interval % action_repeat:
+            raise ValueError(
+                f"replan_interval must be at most planning_horizon={planning_horizon}, a multiple of "
+                f"action_repeat={action_repeat}, and 1 without warm_start, got {replan_interval}"
             )
         if not 0 < warm_std <= 1:
             raise ValueError(f"warm_std must be in (0, 1], got {warm_std}")
@@ -197,24 +209,23 @@ class Planner(MPCPlannerBase):
         self._compiled: Callable[..., Tensor] | None = None
         self.warm_start, self.warm_std = warm_start, warm_std
         self.return_stats, self.stats_risks = bool(return_stats), self._checked_risks(return_stats)
-        self.plan_key, self.init_key = unravel_key(plan_key), unravel_key(init_key)
-        self.action_shape, self.replan_interval = tuple(codec.shape), replan_interval
-        *group, name = [self.plan_key] if isinstance(self.plan_key, str) else self.plan_key
-        self.age_key = unravel_key((*group, f"{name}_age"))
+        self.replan_interval, self.action_repeat = replan_interval, action_repeat
+        self.memory = PlanMemory(
+            codec,
+            planning_horizon,
+            replan_interval,
+            _num_elites,
+            plan_key=plan_key if warm_start else None,
+            init_key=init_key,
+        )
         own = self._env_objective
-        reads = list(env.planning_keys if own is None else own.in_keys)
-        writes = list(written)
-        if warm_start:
-            reads += [self.plan_key, self.init_key]
-            writes.append(unravel_key(("next", self.plan_key)))
+        reads = [*(env.planning_keys if own is None else own.in_keys), *self.memory.in_keys]
+        writes = [*written, *self.memory.out_keys]
         if replan_interval > 1 and return_stats and self.own_statistics:
             raise ValueError(
                 f"replan_interval must be 1 for the statistics of {type(self).__name__}, which are of a "
                 f"search in every step, got {replan_interval}"
             )
-        if replan_interval > 1:
-            reads.append(self.age_key)
-            writes.append(unravel_key(("next", self.age_key)))
         if return_stats:
             names = [
                 *_STATISTICS[: None if self._constrained else -1],
@@ -228,6 +239,11 @@ class Planner(MPCPlannerBase):
             generator.manual_seed(torch.initial_seed() if seed is None else seed)
         self._generator = generator
         self._model_generator = offspring(generator, generator.device)
+
+    @property
+    def num_decisions(self) -> int:
+        """Actions of a plan that are searched: ``planning_horizon / action_repeat``."""
+        return self.planning_horizon // self.action_repeat
 
     @property
     def low(self) -> Tensor:
@@ -270,13 +286,7 @@ class Planner(MPCPlannerBase):
             A primer of ``plan_key``; of nothing without ``warm_start``. It is found by TorchRL's
             ``get_env_transforms_from_module``, which also adds the ``InitTracker``.
         """
-        primers = {}
-        if self.warm_start:
-            shape = (self.planning_horizon, *self.action_shape)
-            primers[self.plan_key] = Unbounded(shape, device=self.low.device, dtype=self.low.dtype)
-        if self.replan_interval > 1:
-            primers[self.age_key] = Unbounded((1,), device=self.low.device, dtype=torch.int64)
-        return TensorDictPrimer(Composite(primers), expand_specs=True)
+        return self.memory.primer(self.low)
 
     def planning(self, td: TensorDictBase) -> Tensor | TensorDictBase:
         """The action to execute.
@@ -317,13 +327,9 @@ class Planner(MPCPlannerBase):
         with torch.no_grad():
             state, plan, age = self._plan_from(tensordict)
             written = self.codec.executed(plan.actions[..., 0, :])
-            if self.warm_start:
-                shifted = torch.cat([plan.actions[..., 1:, :], plan.actions[..., -1:, :]], dim=-2)
-                written.append(self._shaped(shifted))
-            if age is not None:
-                written.append(((age + 1) % self.replan_interval).unsqueeze(-1))
+            written += self.memory.entries(plan, age)
             if self.return_stats:
-                written += [self._shaped(plan.actions), self._shaped(plan.std)]
+                written += [self.memory.shaped(plan.actions), self.memory.shaped(plan.std)]
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
                 written += [plan.statistics[name] for name in self.own_statistics]
         out = tensordict if tensordict_out is None else tensordict_out
@@ -337,10 +343,10 @@ class Planner(MPCPlannerBase):
 
         Args:
             state: what ``planning_state`` of the environment gives, with batch ``*B``.
-            proposal: where the search starts, with batch ``*B``.
+            proposal: where the search starts, with batch ``*B`` and :attr:`num_decisions` steps.
 
         Returns:
-            The plan, inside the bounds and without gradient.
+            The plan of so many steps, inside the bounds and without gradient.
         """
 
     @property
@@ -351,57 +357,33 @@ class Planner(MPCPlannerBase):
         state = self._source.planning_state(tensordict)
         batch = state.shape[:-1] if isinstance(state, Tensor) else state.batch_size
         self._follow_device()
-        start = self._start(tensordict, batch)
-        if self.replan_interval == 1:
-            age, plan = None, self.plan(state, start)
+        recalled = self.memory.recall(tensordict, batch, self.low)
+        start = self._start(recalled, batch)
+        if recalled.plan is None or recalled.age is None:
+            plan = self._search(state, start, recalled)
         else:
-            age, plan = self._continued(tensordict, batch, state, start)
+            # Rows in the middle of a plan go on with it.
+            running = recalled.age > 0
+            stored = self.codec.mode(recalled.plan.clamp(self.low, self.high))
+            std = start.std.repeat_interleave(self.action_repeat, dim=-2)
+            plan = Plan(stored, std, stored, torch.zeros_like(stored[..., 0, 0]), elites=recalled.elites)
+            if not bool(running.all()):
+                plan = plan.where(running, self._search(state, start, recalled))
         warn_of_costs(plan.best_cost, self._constrained)
-        return _Found(state, plan, age)
+        return _Found(state, plan, recalled.age)
 
-    def _continued(
-        self, tensordict: TensorDictBase, batch: torch.Size, state: Any, start: Proposal
-    ) -> tuple[Tensor, Plan]:
-        """Rows in the middle of a plan go on with it; steps of it that were executed, and the plan."""
-        stored, warm = self._remembered(tensordict, batch)
-        age = tensordict.get(self.age_key, None)
-        if stored is None or age is None:
-            return torch.zeros(batch, dtype=torch.int64, device=start.mean.device), self.plan(state, start)
-        age = torch.where(warm, age.reshape(batch), 0)
-        running = age > 0
-        stored = self.codec.mode(stored.clamp(self.low, self.high))
-        old = Plan(stored, start.std, stored, torch.zeros_like(stored[..., 0, 0]))
-        if bool(running.all()):
-            return age, old
-        new = self.plan(state, start)
-        rows = running[..., None, None]
-        return age, Plan(
-            torch.where(rows, old.actions, new.actions),
-            torch.where(rows, old.std, new.std),
-            torch.where(rows, old.best, new.best),
-            torch.where(running, old.best_cost, new.best_cost),
-        )
+    def _search(self, state: Any, start: Proposal, recalled: Recalled) -> Plan:
+        """A plan of all steps, from what is remembered."""
+        return self.plan(state, start).held(self.action_repeat)
 
-    def _start(self, tensordict: TensorDictBase, batch: torch.Size) -> Proposal:
+    def _start(self, recalled: Recalled, batch: torch.Size) -> Proposal:
         """Proposal from the plan of the step before where there is one, else from the bounds."""
-        cold = self.family.cold(batch, self.planning_horizon)
-        plan, warm = self._remembered(tensordict, batch)
-        if plan is None:
+        cold = self.family.cold(batch, self.num_decisions)
+        if recalled.plan is None:
             return cold
-        start = self.family.around(plan, self.warm_std)
-        warm = warm[..., None, None]
+        start = self.family.around(recalled.plan[..., :: self.action_repeat, :], self.warm_std)
+        warm = recalled.warm[..., None, None]
         return Proposal(*(torch.where(warm, a, b) for a, b in zip(start, cold, strict=True)))
-
-    def _remembered(self, tensordict: TensorDictBase, batch: torch.Size) -> tuple[Tensor | None, Tensor]:
-        """The plan of the step before ``(*B, H, A)``, zero in rows without one, and which rows have one."""
-        shape = (*batch, self.planning_horizon, *self.action_shape)
-        plan = tensordict.get(self.plan_key, None) if self.warm_start else None
-        if plan is not None and tuple(plan.shape) != shape:
-            raise ValueError(f"{self.plan_key!r} must have shape {shape}, got {tuple(plan.shape)}")
-        if plan is None:
-            return None, torch.zeros(batch, dtype=torch.bool)
-        plan = plan.to(self.low.dtype).reshape((*batch, self.planning_horizon, self.codec.size))
-        return remembered(plan, tensordict.get(self.init_key, None), zero_is_cold=self.codec.is_continuous)
 
     def _checked_sampling(self, asked: dict[str, Any]) -> bool:
         """Refuse early what the environment cannot evaluate; true if there are constraints."""
@@ -418,7 +400,7 @@ class Planner(MPCPlannerBase):
     def _statistics(self, state: Any, plan: Tensor) -> list[Tensor]:
         """Cost and, if there are constraints, probabilities of violation, from the same noise."""
         noise = self._model_generator.get_state()
-        statistics = [self._evaluate(state, plan)]
+        statistics = [self._costs(state)(plan)]
         if self._constrained:
             self._model_generator.set_state(noise)
             asked = _given({"num_samples": self.num_samples, "constraints": self.constraints})
@@ -428,7 +410,7 @@ class Planner(MPCPlannerBase):
         for risk in self.stats_risks.values():
             self._model_generator.set_state(noise)
             alone = {"constraints": ()} if self._constrained else {}
-            statistics.append(self._evaluate(state, plan, risk=risk, **alone))
+            statistics.append(self._costs(state, risk=risk, **alone)(plan))
         return statistics
 
     def _checked_risks(self, return_stats: bool | Mapping[str, Risk]) -> dict[str, Risk]:
@@ -440,11 +422,15 @@ class Planner(MPCPlannerBase):
             self._checked_sampling(_given({name: getattr(self, name) for name in _SAMPLING}) | {"risk": risk})
         return risks
 
-    def _evaluate(self, state: Any, candidates: Tensor, **instead: Any) -> Tensor:
-        return self._evaluator(state, **instead)(candidates)
+    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
+        """``candidates (*B, N, H / action_repeat, A) -> costs (*B, N)`` of one planning call."""
+        costs, repeat = self._costs(state), self.action_repeat
+        if repeat == 1:
+            return costs
+        return lambda candidates: costs(candidates.repeat_interleave(repeat, dim=-2))
 
-    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
-        """``candidates (*B, N, H, A) -> costs (*B, N)`` of one planning call, infinite where not finite."""
+    def _costs(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
+        """``plans (*B, N, H, A) -> costs (*B, N)`` of one planning call, infinite where not finite."""
         asked = _given({name: getattr(self, name) for name in _SAMPLING}) | instead
         source, generator = self._source, self._model_generator
         # A subclass that gives another objective alone must be asked for that.
@@ -475,9 +461,6 @@ class Planner(MPCPlannerBase):
                 f"compile must be False for the objective of {type(self.env).__name__} on this machine: "
                 f"torch.compile failed with {type(error).__name__}: {error}"
             ) from error
-
-    def _shaped(self, actions: Tensor) -> Tensor:
-        return actions.reshape((*actions.shape[:-1], *self.action_shape))
 
     def __getstate__(self) -> dict[str, Any]:
         packed = {name: pack_generator(self.__dict__[name]) for name in _GENERATORS}

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl_vjepa.actions import ActionCodec
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.base import Planner
-from torchrl_vjepa.planners.expansion import EnvExpansion, Expansion, LatentExpansion
+from torchrl_vjepa.planners.expansion import EnvExpansion, Expansion, HeldExpansion, LatentExpansion
 from torchrl_vjepa.planners.proposal import Proposal
 
 __all__ = ["DiscretePlanner", "joint_choices"]
@@ -107,6 +107,8 @@ class DiscretePlanner(Planner):
     """
 
     choices: Tensor
+    #: Of the costs of single steps.
+    discount: float = 1.0
 
     def __init__(self, env: EnvBase, planning_horizon: int, optim_steps: int = 1, **kwargs: Any) -> None:
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
@@ -139,7 +141,12 @@ class DiscretePlanner(Planner):
         return source.sampling(**asked).num_samples is None
 
     def _expansion(self, state: Any) -> Expansion:
-        """Steps of the environment from a state of planning."""
+        """Decisions in the environment from a state of planning."""
+        expansion: Expansion
         if self._env_objective is not None:
-            return EnvExpansion(self._env_objective, state)
-        return LatentExpansion(self.env, state, self.planning_horizon)
+            expansion = EnvExpansion(self._env_objective, state)
+        else:
+            expansion = LatentExpansion(self.env, state, self.planning_horizon)
+        if self.action_repeat == 1:
+            return expansion
+        return HeldExpansion(expansion, self.action_repeat, self.discount)

@@ -85,8 +85,8 @@ class ExhaustiveSearch(DiscretePlanner):
 
     @property
     def num_plans(self) -> int:
-        """All of them, :math:`n^H`."""
-        return self.num_actions**self.planning_horizon
+        """All of them, :math:`n^H` (of ``H / action_repeat`` decisions)."""
+        return self.num_actions**self.num_decisions
 
     def plan(self, state: Any, proposal: Proposal) -> Plan:
         """Evaluate every plan.
@@ -113,13 +113,13 @@ class ExhaustiveSearch(DiscretePlanner):
 
     def _digits(self, number: Tensor) -> Tensor:
         """Actions ``(*B, H)`` of plans ``(*B)`` in lexical order."""
-        place = torch.arange(self.planning_horizon - 1, -1, -1, device=number.device)
+        place = torch.arange(self.num_decisions - 1, -1, -1, device=number.device)
         return number.unsqueeze(-1) // self.num_actions**place % self.num_actions
 
     def _below(self, expansion: Expansion, state: State, cost: Tensor, step: int) -> tuple[Tensor, Tensor]:
         """Lowest cost ``(R)`` of plans that begin as ``W`` states ``(R, W)`` did, and its number."""
         rows, width = cost.shape
-        if step == self.planning_horizon:
+        if step == self.num_decisions:
             return torch.where(cost.isfinite(), cost, torch.inf).min(dim=1)
         n = self.num_actions
         size = width if self.chunk_size is None else max(1, self.chunk_size // n)
@@ -133,7 +133,7 @@ class ExhaustiveSearch(DiscretePlanner):
     def _in_parts(
         self, expansion: Expansion, state: State, cost: Tensor, step: int, size: int
     ) -> tuple[Tensor, Tensor]:
-        below = self.num_actions ** (self.planning_horizon - step)
+        below = self.num_actions ** (self.num_decisions - step)
         costs, numbers = [], []
         for first in range(0, cost.shape[1], size):
             part = {key: value[:, first : first + size] for key, value in state.items()}
@@ -152,7 +152,7 @@ class ExhaustiveSearch(DiscretePlanner):
             plans = self._coded(self._digits(number))
             # The model's noise is the same in every chunk: their costs compare.
             self._model_generator.set_state(noise)
-            cost, index = self._evaluate(state, plans.expand(*batch, *plans.shape)).min(dim=-1)
+            cost, index = self._evaluator(state)(plans.expand(*batch, *plans.shape)).min(dim=-1)
             costs.append(cost)
             numbers.append(number[index])
         cost, part = torch.stack(costs, dim=-1).min(dim=-1)

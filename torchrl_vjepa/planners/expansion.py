@@ -12,7 +12,7 @@ from torchrl_vjepa.belief import PreparedTransition, rollout
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.env_objective import EnvObjective
 
-__all__ = ["ALIVE", "EnvExpansion", "Expansion", "LatentExpansion", "State"]
+__all__ = ["ALIVE", "EnvExpansion", "Expansion", "HeldExpansion", "LatentExpansion", "State"]
 
 State = dict[NestedKey, Tensor]
 
@@ -184,3 +184,51 @@ class EnvExpansion:
             value = following.get(key, None)
             after[key] = state[key] if value is None else value
         return after, cost
+
+
+class HeldExpansion:
+    r"""Steps of a model that each hold their action for ``repeat`` steps of another.
+
+    They cost :math:`\sum_{j=0}^{r-1} \gamma^j c_j`.
+
+    Args:
+        expansion: of single steps.
+        repeat: steps ``r`` in one.
+        discount: :math:`\gamma`.
+
+    Examples:
+        >>> from torchrl.data import OneHot
+        >>> from torchrl_vjepa.costs import quadratic_cost
+        >>> from torchrl_vjepa.distributions import Delta
+        >>> env = LatentEnv(
+        ...     lambda latent, action: Delta(latent + action),
+        ...     action_spec=OneHot(2),
+        ...     cost=quadratic_cost(torch.zeros(2)),
+        ...     latent_dim=2,
+        ... )
+        >>> leap = HeldExpansion(LatentExpansion(env, torch.zeros(5, 2), 6), repeat=2)
+        >>> leap.expand(leap.root, torch.tensor([1.0, 0.0]).expand(5, 2), 0)[1]  # 1 + 4
+        tensor([5., 5., 5., 5., 5.])
+    """
+
+    def __init__(self, expansion: Expansion, repeat: int, discount: float = 1.0) -> None:
+        self.expansion, self.repeat, self.discount = expansion, repeat, discount
+        self.root = expansion.root
+
+    def expand(self, state: State, action: Tensor, step: int | Tensor) -> tuple[State, Tensor]:
+        """All steps for which the action is held.
+
+        Args:
+            state: entries with batch ``(R, *X)``.
+            action: codes, of shape ``(R, *X, A)``.
+            step: how many times an action was held before: one number, or one for each row, ``(R)``.
+
+        Returns:
+            Next state, and the costs, of shape ``(R, *X)``.
+        """
+        first = step * self.repeat
+        state, total = self.expansion.expand(state, action, first)
+        for j in range(1, self.repeat):
+            state, cost = self.expansion.expand(state, action, first + j)
+            total = total + self.discount**j * cost
+        return state, total

@@ -26,6 +26,7 @@ class Plan(NamedTuple):
             :data:`~torchrl_vjepa.risk.REJECTED_COST` where no plan satisfied the chance constraints.
         statistics: what else a search has to tell, one entry with batch ``*B`` for each name in
             ``own_statistics`` of its planner.
+        elites: plans beside it that the next search begins with, of shape ``(*B, E, H, A)``, or ``None``.
 
     Examples:
         >>> import torch
@@ -39,6 +40,48 @@ class Plan(NamedTuple):
     best: Tensor
     best_cost: Tensor
     statistics: Mapping[str, Tensor] = MappingProxyType({})
+    elites: Tensor | None = None
+
+    def held(self, repeat: int) -> Plan:
+        """The plan with each of its actions held for some steps.
+
+        Args:
+            repeat: steps.
+
+        Returns:
+            A plan of ``repeat`` times as many steps.
+        """
+        if repeat == 1:
+            return self
+        elites = None if self.elites is None else self.elites.repeat_interleave(repeat, dim=-2)
+        return self._replace(
+            actions=self.actions.repeat_interleave(repeat, dim=-2),
+            std=self.std.repeat_interleave(repeat, dim=-2),
+            best=self.best.repeat_interleave(repeat, dim=-2),
+            elites=elites,
+        )
+
+    def where(self, rows: Tensor, other: Plan) -> Plan:
+        """The plan in some rows, another in the rest.
+
+        Args:
+            rows: flags of shape ``(*B)``.
+            other: of the same shapes; its statistics are taken, and its elites where this plan has none.
+
+        Returns:
+            The plan.
+        """
+        elites = other.elites
+        if elites is not None and self.elites is not None:
+            elites = torch.where(rows[..., None, None, None], self.elites, elites)
+        wide = rows[..., None, None]
+        return other._replace(
+            actions=torch.where(wide, self.actions, other.actions),
+            std=torch.where(wide, self.std, other.std),
+            best=torch.where(wide, self.best, other.best),
+            best_cost=torch.where(rows, self.best_cost, other.best_cost),
+            elites=elites,
+        )
 
 
 def check_counts(**counts: int) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_vjepa.planners.base import Planner
+from torchrl_vjepa.planners.memory import Recalled
 from torchrl_vjepa.planners.noise import coloured_noise_factor
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
@@ -51,8 +52,9 @@ class SamplingPlanner(Planner):
             the weight of the uniform distribution in the proposal.
         antithetic: draw noise in pairs of opposite sign.
         chunk_size: candidates (of every row) that are imagined at a time; all by default. The memory of a
-            round is then that of ``chunk_size`` candidates; the plan is the same up to rounding, except in
-            environments that draw their own noise.
+            plan is at most that of one with ``num_candidates=chunk_size``, and ten times the candidates
+            ``(*B, N, H, A)``; the plan is the same up to rounding, except in environments that draw their own
+            noise.
         max_ms: time for a plan, in milliseconds: no round begins that would end later, if it took as long as
             the longest before it. The first always runs; the plan is that of the rounds that did. Waits for
             the device after each round, and how far planning gets depends on the machine and the batch size.
@@ -62,6 +64,12 @@ class SamplingPlanner(Planner):
             power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
             (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
         keep_elites: fraction of the elites that are candidates again in the next round.
+        carry_elites: fraction of the last round's elites that are candidates in the first round of the next
+            step, one step on; needs ``warm_start``. They are carried in the tensordict, under ``plan_key``
+            with ``_elites`` appended.
+        population_decay: candidates of a round as a fraction of those of the round before, but at least
+            twice ``top_k``: later rounds search a smaller space. With 0.8, ``keep_elites`` and
+            ``carry_elites`` of 0.3 and ``noise_beta=2``, CEM is iCEM.
         **kwargs: see :class:`Planner`.
 
     Raises:
@@ -110,6 +118,8 @@ class SamplingPlanner(Planner):
         output: Literal["mean", "best"] = "mean",
         noise_beta: float = 0.0,
         keep_elites: float = 0.0,
+        carry_elites: float = 0.0,
+        population_decay: float = 1.0,
         **kwargs: Any,
     ) -> None:
         check_counts(num_candidates=num_candidates)
@@ -127,16 +137,25 @@ class SamplingPlanner(Planner):
             raise ValueError(f"max_ms must be positive and finite, in milliseconds, or None, got {max_ms}")
         if not 0 <= noise_beta <= 4:
             raise ValueError(f"noise_beta must be in [0, 4], got {noise_beta}")
-        if not 0 <= keep_elites <= 1:
-            raise ValueError(f"keep_elites must be in [0, 1], got {keep_elites}")
-        super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        for name, fraction in (("keep_elites", keep_elites), ("carry_elites", carry_elites)):
+            if not 0 <= fraction <= 1:
+                raise ValueError(f"{name} must be in [0, 1], got {fraction}")
+        if carry_elites and not kwargs.get("warm_start", True):
+            raise ValueError(f"carry_elites must be 0 without warm_start, got {carry_elites}")
+        if not 0 < population_decay <= 1:
+            raise ValueError(f"population_decay must be in (0, 1], got {population_decay}")
+        carried = min(math.ceil(carry_elites * top_k), num_candidates - 2)
+        if carry_elites and carried < 1:
+            raise ValueError(f"num_candidates must be at least 3 to carry elites, got {num_candidates}")
+        super().__init__(env, planning_horizon, optim_steps, _num_elites=max(0, carried), **kwargs)
         self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
-        self.noise_beta, self.keep_elites = noise_beta, keep_elites
+        self.noise_beta, self.keep_elites, self.carry_elites = noise_beta, keep_elites, carry_elites
+        self.population_decay = population_decay
         # The best plan is a candidate again anyway, so it is the next ones that are kept.
         self._num_kept = min(int(keep_elites * top_k), top_k - 1, max(0, num_candidates - 2))
-        colour = coloured_noise_factor(planning_horizon, noise_beta) if noise_beta else None
+        colour = coloured_noise_factor(self.num_decisions, noise_beta) if noise_beta else None
         self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
     @abc.abstractmethod
@@ -154,12 +173,14 @@ class SamplingPlanner(Planner):
             between the floor and the spread of a cold start.
         """
 
-    def plan(self, state: Any, proposal: Proposal) -> Plan:
+    def plan(self, state: Any, proposal: Proposal, suggested: Tensor | None = None) -> Plan:
         """Plan from a state: the whole algorithm, on tensors.
 
         Args:
             state: what ``planning_state`` of the environment gives, with batch ``*B``.
             proposal: where the search starts, with batch ``*B``.
+            suggested: plans that are candidates of the first round, of shape ``(*B, E, H, A)``, ``E`` at most
+                ``num_candidates - 2``; put inside the bounds, drawn where they are not finite.
 
         Returns:
             The plan. No value leaves the device.
@@ -171,11 +192,11 @@ class SamplingPlanner(Planner):
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
         clock = None if self.max_ms is None else _Clock(self.max_ms)
-        kept = None
-        for _ in range(self.optim_steps):
+        kept = suggested
+        for round_ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.
             generator.set_state(model_state)
-            candidates = self._candidates(proposal, best, kept)
+            candidates = self._candidates(proposal, best, kept, self._population(round_))
             costs = evaluate(candidates)
             elite_costs, index = costs.topk(top_k, dim=-1, largest=False)
             if constrained:
@@ -202,10 +223,21 @@ class SamplingPlanner(Planner):
             cost = evaluate(actions.unsqueeze(-3))[..., 0]
             worse = (cost >= REJECTED_COST) & (best_cost < cost)
             actions = torch.where(worse[..., None, None], best, actions)
-        return Plan(actions, proposal.std, best, best_cost)
+        carried = elites[..., : self.memory.num_elites, :, :] if self.memory.num_elites else None
+        return Plan(actions, proposal.std, best, best_cost, elites=carried)
 
-    def _evaluator(self, state: Any, **instead: Any) -> Callable[[Tensor], Tensor]:
-        evaluate = super()._evaluator(state, **instead)
+    def _population(self, round_: int) -> int:
+        decayed = round(self.num_candidates * self.population_decay**round_)
+        return min(self.num_candidates, max(decayed, 2 * self.top_k))
+
+    def _search(self, state: Any, start: Proposal, recalled: Recalled) -> Plan:
+        if recalled.elites is None:
+            return super()._search(state, start, recalled)
+        suggested = recalled.elites[..., :: self.action_repeat, :]
+        return self.plan(state, start, suggested).held(self.action_repeat)
+
+    def _evaluator(self, state: Any) -> Callable[[Tensor], Tensor]:
+        evaluate = super()._evaluator(state)
         size, generator = self.chunk_size, self._model_generator
         if size is None:
             return evaluate
@@ -220,10 +252,12 @@ class SamplingPlanner(Planner):
 
         return in_chunks
 
-    def _candidates(self, proposal: Proposal, best: Tensor, kept: Tensor | None = None) -> Tensor:
+    def _candidates(
+        self, proposal: Proposal, best: Tensor, kept: Tensor | None = None, num: int | None = None
+    ) -> Tensor:
         """Candidates ``(*B, N, H, A)`` inside the bounds, the mean and the best plan among them."""
         mean = proposal.mean
-        num = self.num_candidates
+        num = self.num_candidates if num is None else num
         drawn = (num + 1) // 2 if self.antithetic else num
         noise = torch.randn(
             (drawn, mean.shape[-2], self.family.noise_dim),
@@ -240,8 +274,11 @@ class SamplingPlanner(Planner):
             candidates[..., 0, :, :] = self.codec.mode(mean)
         if num > 2:
             candidates[..., 1, :, :] = best
-        if kept is not None and self._num_kept:
-            candidates[..., num - self._num_kept :, :, :] = kept
+        if kept is not None and kept.shape[-3]:
+            last = candidates[..., num - kept.shape[-3] :, :, :]
+            exists = kept.isfinite().flatten(-2).all(dim=-1)[..., None, None]
+            kept = self.codec.mode(kept.clamp(self.low, self.high))
+            last.copy_(torch.where(exists, kept, last))
         return candidates
 
 

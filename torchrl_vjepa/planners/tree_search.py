@@ -170,7 +170,7 @@ class TreeSearch(DiscretePlanner):
             The plan. ``best`` is the cheapest simulation, whose cost contains the leaf's value.
         """
         batch = proposal.mean.shape[:-2]
-        shape = (self.num_simulations, self.planning_horizon, self.num_actions)
+        shape = (self.num_simulations, self.num_decisions, self.num_actions)
         noise = proposal.mean.new_empty(shape).exponential_(generator=self._generator).log().neg()
         if not batch.numel():
             empty = proposal.mean.new_zeros(*batch, self.num_actions)
@@ -178,7 +178,7 @@ class TreeSearch(DiscretePlanner):
             return Plan(*proposal, proposal.mean, empty[..., 0], statistics)
         index, warm = self._numbered(proposal)
         any_warm = bool(warm.any())
-        room = 1 + self.num_simulations + self.planning_horizon * any_warm
+        room = 1 + self.num_simulations + self.num_decisions * any_warm
         search = _Search(self, self._expansion(state), room)
         if any_warm:
             search.follow(index, warm)
@@ -213,7 +213,7 @@ class _Search:
     """One call: the trees, the states of their nodes, and the cheapest simulation so far."""
 
     def __init__(self, planner: TreeSearch, expansion: Expansion, num_nodes: int) -> None:
-        self.planner, self.expansion, self.horizon = planner, expansion, planner.planning_horizon
+        self.planner, self.expansion, self.horizon = planner, expansion, planner.num_decisions
         root = expansion.root
         alive = root[ALIVE]
         self.rows = torch.arange(alive.shape[0], device=alive.device)
@@ -327,7 +327,7 @@ class _Search:
         return -self._weight(depth) * (alive * value).to(self.paid.dtype)
 
     def _weight(self, step: int | Tensor) -> Tensor | float:
-        discount = self.planner.discount
+        discount = self.planner.discount**self.planner.action_repeat
         return discount**step if isinstance(step, int) else discount ** step.to(self.paid.dtype)
 
     @staticmethod
