@@ -107,10 +107,8 @@ def test_the_value_is_that_of_the_best_plan(cartpole: Any, end_cost: float) -> N
     discount, horizon = 0.5, 11
     env = corridor(cartpole, end_cost)
     places = torch.arange(7.0).unsqueeze(1)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        value = cartpole.Value(1, 32)
-        cartpole.value_iteration(value, env, places, discount=discount, sweeps=60, steps=20, lr=1e-2)
+    value = cartpole.Value(1, 32)
+    cartpole.value_iteration(value, env, places, discount=discount, sweeps=60, steps=20, lr=1e-2)
     # Of all plans in numbers: what comes behind the horizon weighs less than 0.001.
     expected = []
     for place in range(7):
@@ -136,10 +134,8 @@ def test_the_leaves_of_tree_search_have_the_value(cartpole: Any, run: Any) -> No
 def test_rounding_below_zero_does_not_spoil_the_value(cartpole: Any) -> None:
     env = corridor(cartpole, 0.0)
     env.world_model.cost = lambda latent, action: torch.full_like(latent[..., 0], -1e-6)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        value = cartpole.Value(1, 8)
-        cartpole.value_iteration(value, env, torch.ones(3, 1), discount=0.1, sweeps=40, steps=5, lr=0.1)
+    value = cartpole.Value(1, 8)
+    cartpole.value_iteration(value, env, torch.ones(3, 1), discount=0.1, sweeps=40, steps=5, lr=0.1)
     assert value(torch.ones(3, 1)).isfinite().all()
 
 
