@@ -418,12 +418,13 @@ def figure(
         learned.plot(steps, lengths, color="0.3", marker=marker, ms=4, lw=1, label=f"seed {seed}")
     learned.set(
         xlabel="environment steps",
-        ylabel="steps for each fall",
+        ylabel="steps for each fall (at most all of a round)",
         title="While collecting, with random actions in between",
-        ylim=(0, None),
+        yscale="log",
         xlim=(0, None),
     )
-    learned.legend(frameon=False)
+    learned.yaxis.set_major_formatter("{x:,.0f}")
+    learned.legend(frameon=False, loc="lower right")
     for name, style in STYLES.items():
         if name not in next(iter(returns.values())):
             continue
