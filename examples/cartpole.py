@@ -166,7 +166,7 @@ class Value(nn.Module):
     def __init__(self, size: int, num_cells: int) -> None:
         super().__init__()
         layers = MLP(in_features=size, out_features=1, num_cells=[num_cells] * 2, activation_class=nn.SiLU)
-        self.root = nn.Sequential(layers, nn.Softplus(), nn.Flatten(-2))
+        self.root = nn.Sequential(layers, nn.Flatten(-2))
 
     def forward(self, latent: Tensor) -> Tensor:
         """Values ``(*B)`` of latents ``(*B, D)``."""

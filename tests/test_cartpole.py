@@ -88,7 +88,7 @@ def test_the_world_is_cheapest_where_episodes_begin(run: Any) -> None:
 
 
 def corridor(cartpole: Any, end_cost: float) -> LatentEnv:
-    """Places 0 to 6, left or right; it costs to be far from 2, and the episode ends at 4 half of the time, behind it always."""
+    """Places 0 to 6, left or right; it costs to be far from 2; the episode may end at 4, and does behind it."""
     ends = nn.Linear(1, 1)
     nn.init.constant_(ends.weight, 40.0)
     nn.init.constant_(ends.bias, -160.0)
@@ -122,7 +122,7 @@ def test_the_value_is_that_of_the_best_plan(cartpole: Any, end_cost: float) -> N
                 weight *= discount * (1 - ends[now])
             best = min(best, cost)
         expected.append(-best)
-    torch.testing.assert_close(value(places), torch.tensor(expected), rtol=0.05, atol=0.1)
+    torch.testing.assert_close(value(places), torch.tensor(expected), rtol=2e-3, atol=2e-3)
 
 
 def test_the_leaves_of_tree_search_have_the_value(cartpole: Any, run: Any) -> None:
