@@ -88,7 +88,7 @@ def test_the_world_is_cheapest_where_episodes_begin(run: Any) -> None:
 
 
 def corridor(cartpole: Any, end_cost: float) -> LatentEnv:
-    """Places 0 to 6, left or right; it costs to be far from 2; the episode may end at 4, and does behind it."""
+    """Places 0 to 6, left or right; far from 2 costs more; an episode may end at 4, and does behind it."""
     ends = nn.Linear(1, 1)
     nn.init.constant_(ends.weight, 40.0)
     nn.init.constant_(ends.bias, -160.0)
