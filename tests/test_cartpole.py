@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torchrl.envs import GymEnv
+
+from torchrl_vjepa import Delta, LatentEnv, TreeSearch
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchrl_vjepa.CollapseWarning")
 
@@ -23,7 +28,14 @@ def cartpole() -> Any:
 def run(cartpole: Any) -> Any:
     """A small run, not trained."""
     settings = cartpole.Settings(
-        random_steps=200, rounds=1, collect_steps=40, train_steps=3, planning_horizon=4, num_candidates=8
+        random_steps=200,
+        rounds=1,
+        collect_steps=40,
+        train_steps=3,
+        planning_horizon=4,
+        num_candidates=8,
+        value_sweeps=2,
+        value_steps=2,
     )
     return cartpole.Run(3, settings)
 
@@ -75,9 +87,64 @@ def test_the_world_is_cheapest_where_episodes_begin(run: Any) -> None:
     torch.testing.assert_close(costs[first].mean(), torch.tensor(expected), rtol=1e-2, atol=1e-4)
 
 
+def corridor(cartpole: Any, end_cost: float) -> LatentEnv:
+    """Places 0 to 6, left or right; far from 2 costs more; an episode may end at 4, and does behind it."""
+    ends = nn.Linear(1, 1)
+    nn.init.constant_(ends.weight, 40.0)
+    nn.init.constant_(ends.bias, -160.0)
+    return LatentEnv(
+        lambda latent, action: Delta((latent + action[..., 1:] - action[..., :1]).clamp(0, 6)),
+        action_spec=cartpole.ACTIONS,
+        cost=lambda latent, action: (latent - 2).square().sum(-1),
+        latent_dim=1,
+        termination_model=TensorDictModule(ends, ["latent"], ["termination_logit"]),
+        termination_cost=end_cost,
+    )
+
+
+@pytest.mark.parametrize("end_cost", [0.0, 50.0])
+def test_the_value_is_that_of_the_best_plan(cartpole: Any, end_cost: float) -> None:
+    discount, horizon = 0.5, 11
+    env = corridor(cartpole, end_cost)
+    places = torch.arange(7.0).unsqueeze(1)
+    value = cartpole.Value(1, 32)
+    cartpole.value_iteration(value, env, places, discount=discount, sweeps=60, steps=20, lr=1e-2)
+    # Of all plans in numbers: what comes behind the horizon weighs less than 0.001.
+    ends = [0, 0, 0, 0, 0.5, 1, 1]
+    expected = []
+    for place in range(7):
+        best = float("inf")
+        for plan in itertools.product((-1, 1), repeat=horizon):
+            now, weight, cost = place, 1.0, 0.0
+            for move in plan:
+                now = min(6, max(0, now + move))
+                cost += weight * ((now - 2) ** 2 + ends[now] * end_cost)
+                weight *= discount * (1 - ends[now])
+            best = min(best, cost)
+        expected.append(-best)
+    torch.testing.assert_close(value(places), torch.tensor(expected), rtol=0.03, atol=0.05)
+
+
+def test_the_leaves_of_tree_search_have_the_value(cartpole: Any, run: Any) -> None:
+    planner = run.planner("tree-search")
+    assert isinstance(planner, TreeSearch)
+    assert planner.leaf_value is run.value
+    assert planner.discount == run.settings.discount
+
+
+def test_rounding_below_zero_does_not_spoil_the_value(cartpole: Any) -> None:
+    env = corridor(cartpole, 0.0)
+    env.world_model.cost = lambda latent, action: torch.full_like(latent[..., 0], -1e-6)
+    value = cartpole.Value(1, 8)
+    cartpole.value_iteration(value, env, torch.ones(3, 1), discount=0.1, sweeps=40, steps=5, lr=0.1)
+    assert value(torch.ones(3, 1)).isfinite().all()
+
+
 def test_a_round_collects_and_learns(cartpole: Any, run: Any) -> None:
+    before = [parameter.clone() for parameter in run.value.parameters()]
     run.learn()
     assert len(run.buffer) == 240
+    assert not any(map(torch.equal, before, run.value.parameters()))
     assert [steps for steps, _ in run.lengths] == [200, 240]
     assert run.buffer[:]["action"].sum(-1).eq(1).all()
     rows = run.buffer[:]["episode"]

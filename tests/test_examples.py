@@ -328,6 +328,10 @@ def check_goal_swap_report(report: dict[str, Any]) -> None:
 FAMILIES = ("goal", "keep-out", "two-regions")
 
 
+CARTPOLE_KEYS = {"planner", "seed", "env_steps", "return_mean", "return_min", "balanced"}
+CARTPOLE_KEYS |= {"learning_cpu_s", "evaluation_cpu_s"}
+
+
 def check_cartpole_report(report: dict[str, Any]) -> None:
     """Checks the report of ``cartpole.py``: one row for each planner and seed."""
     assert set(report) == {"settings", "wall_s", "rows", "curves"}
@@ -338,8 +342,10 @@ def check_cartpole_report(report: dict[str, Any]) -> None:
     ]
     steps = settings["random_steps"] + settings["rounds"] * settings["collect_steps"]
     for row in rows:
-        assert {"planner", "seed", "env_steps", "return_mean", "return_min"} <= set(row)
+        assert set(row) == CARTPOLE_KEYS
         assert row["env_steps"] == steps <= 20_000
+        assert row["learning_cpu_s"] > 0
+        assert row["evaluation_cpu_s"] > 0
         assert 1 <= row["return_min"] <= row["return_mean"] <= 500
         assert 0 <= row["balanced"] <= 1
     for curve in report["curves"].values():

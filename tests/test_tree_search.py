@@ -38,6 +38,7 @@ from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners import ExhaustiveSearch, Planner, Proposal, TreeSearch
 from torchrl_vjepa.planners.discrete import DiscretePlanner, joint_choices
 from torchrl_vjepa.planners.search_tree import SearchTree
+from torchrl_vjepa.predictor import Predictor
 from torchrl_vjepa.risk import cvar
 
 F64 = {"dtype": torch.float64}
@@ -104,6 +105,23 @@ class Counter:
         self.calls += 1
         self.states += latent[..., 0].numel()
         return swirl(latent, action)
+
+
+@search
+def test_networks_compute_in_the_dtype_of_the_environment(
+    cls: type[DiscretePlanner], kwargs: dict[str, Any]
+) -> None:
+    torch.manual_seed(0)
+    predictor = Predictor(3, action_dim=3, trunk="mlp", num_cells=[16], residual=True)
+    rough = make_env(model=predictor, dtype=torch.float32, rollout_dtype=torch.bfloat16)
+    fine = make_env(model=predictor, dtype=torch.float32)
+    start = latents(5).float()
+    with torch.no_grad():
+        planner = cls(rough, 4, seed=0, **kwargs)
+        plan = planner.plan(start, cold(planner, 5))
+        best = plan.best.unsqueeze(-3)
+        torch.testing.assert_close(plan.best_cost, rough.objective(start, best).squeeze(-1))
+        assert not torch.isclose(plan.best_cost, fine.objective(start, best).squeeze(-1), rtol=1e-5).any()
 
 
 class TestChoices:

@@ -8,8 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_vjepa.belief import ParticleBelief
-from torchrl_vjepa.distributions import point_estimate
+from torchrl_vjepa.belief import ParticleBelief, PreparedTransition, rollout
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.env_objective import EnvObjective
 
@@ -109,6 +108,7 @@ class LatentExpansion:
 
     def __init__(self, env: LatentEnv, state: Tensor | TensorDictBase, horizon: int) -> None:
         self.env = env
+        self.transition = PreparedTransition(env.world_model.transition, env.rollout_dtype)
         if isinstance(state, Tensor):
             latent = state
         elif state.get("latent", None) is not None:
@@ -159,8 +159,10 @@ class LatentExpansion:
             Next state, as alive as before.
         """
         env, latent = self.env, state[self.env.latent_key]
-        p = env.world_model.transition(latent, action.to(latent.dtype))
-        return {**state, env.latent_key: point_estimate(p, "mode" if env.how == "mode" else "mean")}
+        # A plan of one step: the short way to the point, in the environment's dtype.
+        plan = action.to(latent.dtype).unsqueeze(-2)
+        moved = rollout(self.transition, latent, plan, "mode" if env.how == "mode" else "mean")
+        return {**state, env.latent_key: moved.squeeze(-2).to(latent.dtype)}
 
     def _tasks_at(self, step: int | Tensor, extra: int) -> State:
         """Tasks of a step, ``(R, *1, *task)``: they broadcast against ``(R, *X)``."""
