@@ -18,6 +18,7 @@ from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners import (
     CEM,
     MPPI,
+    EnvObjective,
     ExhaustiveSearch,
     GradientMPC,
     Plan,
@@ -26,6 +27,8 @@ from torchrl_vjepa.planners import (
     RandomShooting,
     TreeSearch,
 )
+from torchrl_vjepa.planners.expansion import EnvExpansion, HeldExpansion
+from torchrl_vjepa.priors import GoalPrior
 
 GOAL = torch.tensor([1.0, -0.7])
 NUMBERS, CHOICES = Bounded(-1, 1, (2,)), OneHot(2, dtype=torch.float32)
@@ -98,12 +101,21 @@ class TestActionRepeat:
         self, cls: type[Planner], kwargs: dict[str, Any], spec: Any, repeat: int
     ) -> None:
         held = cls(make_env(spec), 2 * repeat, seed=0, action_repeat=repeat, **kwargs)
-        leap = leaping_env(spec, repeat, kwargs.get("discount", 1.0))
-        expected = cls(leap, 2, seed=0, **kwargs)(states())["next", "plan"]
-        actual = held(states())
-        # Shifted by one step already, of the first leap.
-        torch.testing.assert_close(actual["next", "plan"][:, repeat - 1], expected[:, 0])
-        torch.testing.assert_close(actual["next", "plan"][:, 0], actual["action"])
+        env = leaping_env(spec, repeat, kwargs.get("discount", 1.0))
+        if "discount" in kwargs:
+            kwargs = {**kwargs, "discount": kwargs["discount"] ** repeat}
+        leap = cls(env, 2, seed=0, **kwargs)
+        latent = states()["latent"]
+        start = held.family.cold((3,), 2)
+        actual, expected = held.plan(latent, start), leap.plan(latent, start)
+        for name in ("actions", "std", "best", "best_cost"):
+            torch.testing.assert_close(getattr(actual, name), getattr(expected, name))
+        for name, value in expected.statistics.items():
+            torch.testing.assert_close(actual.statistics[name], value)
+        long = actual.held(repeat)
+        assert long.actions.shape == long.best.shape == (3, 2 * repeat, 2)
+        assert torch.equal(long.std[:, ::repeat], actual.std)
+        assert torch.equal(long.std[:, repeat - 1 :: repeat], actual.std)
 
     @pytest.mark.parametrize(("cls", "kwargs", "spec"), EVERY)
     def test_actions_are_held_and_searches_are_as_rare(
@@ -152,6 +164,49 @@ class TestActionRepeat:
             torch.testing.assert_close(td["plan_stats", "cost"], cost)
             td = planner(states().update(td["next"]))
 
+    @pytest.mark.parametrize(("cls", "kwargs", "spec"), EVERY)
+    def test_without_a_warm_start_too(self, cls: type[Planner], kwargs: dict[str, Any], spec: Any) -> None:
+        """Actions are held, and each search starts from nothing: it finds what the first one would."""
+        kwargs = {**kwargs, "warm_start": False}
+        planner = cls(make_env(spec), 4, seed=0, action_repeat=2, return_stats=True, **kwargs)
+        td, actions = states(), []
+        for _ in range(4):
+            td = planner(td)
+            actions.append(td["action"])
+            td = states().update(td["next"])
+        assert torch.equal(actions[0], actions[1])
+        assert torch.equal(actions[2], actions[3])
+        start = planner._start(planner.memory.recall(td, torch.Size([3]), planner.low), torch.Size([3]))
+        assert torch.equal(start.mean, planner.family.cold((3,), 2).mean)
+
+    def test_tasks_are_those_of_the_steps(self) -> None:
+        """A path that is asked for step by step, followed by actions that are held."""
+        spec = OneHot(2, dtype=torch.float32)
+        env = LatentEnv(step, action_spec=spec, prior=GoalPrior(std=1.0), latent_dim=2)
+        path = torch.randn(3, 4, 2, generator=torch.Generator().manual_seed(1))
+        td = states().set("task", path)
+        for planner in (
+            ExhaustiveSearch(env, 4, action_repeat=2),
+            TreeSearch(env, 4, 24, action_repeat=2, output="best", seed=0),
+        ):
+            plan = planner.plan(env.planning_state(td), planner.family.cold((3,), 2))
+            cost = env.objective(env.planning_state(td), plan.held(2).best.unsqueeze(1)).squeeze(1)
+            torch.testing.assert_close(plan.best_cost, cost)
+
+    def test_what_has_ended_costs_nothing_more(self) -> None:
+        class Ends(PendulumEnv):
+            def _step(self, tensordict: Any) -> Any:
+                out = super()._step(tensordict)
+                return out.set("done", torch.ones_like(out["done"])).set("terminated", out["done"])
+
+        source = EnvObjective(Ends(seed=0))
+        root = EnvExpansion(source, source.planning_state(Ends(seed=0).reset()))
+        action = torch.ones(1, 1)
+        state, first = root.expand(root.root, action, 0)
+        assert first > 0
+        assert root.expand(state, action, 1)[1] == 0
+        assert HeldExpansion(root, 3).expand(root.root, action, 0)[1] == first
+
     def test_it_steps_other_environments(self) -> None:
         env = PendulumEnv(seed=0)
         planner = CEM(env, 10, 2, 32, seed=0, action_repeat=5)
@@ -163,14 +218,97 @@ class TestActionRepeat:
     def test_bad_repeats_are_refused(self) -> None:
         with pytest.raises(ValueError, match="planning_horizon must be a multiple of action_repeat=4, got 6"):
             CEM(make_env(), 6, action_repeat=4)
-        with pytest.raises(
-            ValueError, match="a multiple of action_repeat=2, and 1 without warm_start, got 3"
-        ):
+        with pytest.raises(ValueError, match="horizon=6 and a multiple of action_repeat=2, got 3"):
             CEM(make_env(), 6, action_repeat=2, replan_interval=3)
-        with pytest.raises(ValueError, match="1 without warm_start, got 2"):
-            CEM(make_env(), 6, action_repeat=2, warm_start=False)
         with pytest.raises(ValueError, match="action_repeat must be an integer of at least 1, got 0"):
             CEM(make_env(), 6, action_repeat=0)
+
+
+class TestRows:
+    """Rows are at steps of their own: what one does is no matter of the others."""
+
+    OPTIONS = (
+        {"action_repeat": 2},
+        {"replan_interval": 3},
+        {"replan_interval": 4, "action_repeat": 2, "carry_elites": 0.5},
+        {"action_repeat": 2, "warm_start": False},
+    )
+
+    @staticmethod
+    def walked(planner: Planner, rows: slice, resets: dict[int, int], steps: int = 9) -> Tensor:
+        td, actions = states(4)[rows], []
+        for k in range(steps):
+            td = planner(td)
+            actions.append(td["action"])
+            is_init = torch.tensor([[resets.get(row, -1) == k] for row in range(4)])[rows]
+            latent = td["latent"] + 0.3 * td["action"]
+            td = TensorDict({"latent": latent, "is_init": is_init}, batch_size=td.batch_size).update(
+                td["next"]
+            )
+        return torch.stack(actions, dim=1)
+
+    @pytest.mark.parametrize("cls", [RandomShooting, CEM, MPPI])
+    @pytest.mark.parametrize("options", OPTIONS)
+    def test_any_split_of_a_batch_over_many_steps(self, cls: type[Planner], options: dict[str, Any]) -> None:
+        resets = {1: 0, 2: 3}
+        kwargs = {"num_candidates": 24, "optim_steps": 2, "seed": 0, **options}
+        together = self.walked(cls(make_env(), 8, **kwargs), slice(None), resets)
+        for rows in (slice(0, 1), slice(1, 3), slice(2, 4)):
+            alone = self.walked(cls(make_env(), 8, **kwargs), rows, resets)
+            torch.testing.assert_close(alone, together[rows])
+
+    @pytest.mark.parametrize("options", OPTIONS)
+    def test_only_rows_whose_turn_it_is_are_searched(self, options: dict[str, Any]) -> None:
+        planner = Counter(make_env(), 8, 1, 16, seed=0, **options)
+        self.walked(planner, slice(None), {1: 0, 2: 3}, steps=8)
+        interval = planner.replan_interval
+        searched = sum(start.mean.shape[0] for start in planner.starts)
+        due = 2 * len(range(0, 8, interval)) + 1 + len(range(1, 8, interval))
+        due += len(range(0, 4, interval)) + len(range(4, 8, interval))
+        assert searched == due
+
+    def test_a_plan_of_zeros_is_one(self) -> None:
+        planner = Counter(make_env(), 6, 1, 16, seed=0, action_repeat=3)
+        td = states().set("plan", torch.zeros(3, 6, 2)).set("plan_age", torch.tensor([[1], [2], [0]]))
+        td["is_init"] = torch.zeros(3, 1, dtype=torch.bool)
+        out = planner(td)
+        assert not out["action"][:2].any()
+        assert planner.starts[0].mean.shape == (1, 2, 2)
+        assert (planner.starts[0].std < planner.cold_std).all()  # and one to start from
+        known_from_zeros_alone = planner(td.exclude("is_init"))
+        assert known_from_zeros_alone["action"].any(-1).all()
+
+    def test_statistics_and_elites_of_both_kinds(self) -> None:
+        planner = TreeSearch(make_env(CHOICES), 4, 8, seed=0, action_repeat=2, return_stats=True)
+        td = states().update(planner(states())["next"])
+        td["is_init"] = torch.tensor([[False], [True], [False]])
+        out = planner(td)
+        assert out["plan_stats", "visits"].sum(-1).tolist() == [0, 8, 0]
+        assert out["plan_stats", "value"].squeeze(-1).tolist()[0] == 0
+        std = planner._start(planner.memory.recall(td, torch.Size([3]), planner.low), torch.Size([3])).std
+        held = out["plan_stats", "std"][0]
+        torch.testing.assert_close(held, std[0].repeat_interleave(2, dim=0))
+
+        cem = CEM(make_env(), 6, 1, 16, 4, seed=0, carry_elites=0.5, replan_interval=3, action_repeat=3)
+        td = states().update(cem(states())["next"])
+        td["is_init"] = torch.tensor([[False], [True], [False]])
+        after = cem(td.clone())["next", "plan_elites"]
+        shifted = torch.cat([td["plan_elites"][:, :, 1:], td["plan_elites"][:, :, -1:]], dim=2)
+        assert torch.equal(after[[0, 2]], shifted[[0, 2]])
+        assert not torch.equal(after[1], shifted[1])
+
+    def test_carried_elites_are_held_ones(self) -> None:
+        planner = Counter(make_env(), 6, 1, 16, 4, seed=0, carry_elites=0.5, action_repeat=2)
+        td = planner(states())
+        td = planner(states().update(td["next"]))
+        planner(states().update(td["next"]))
+        assert torch.equal(planner.tried[1][:, -2:], td["next", "plan_elites"][:, :, ::2])
+
+    def test_an_age_of_another_shape_is_named(self) -> None:
+        planner = CEM(make_env(), 6, 1, 16, seed=0, replan_interval=2)
+        td = states().update(planner(states())["next"]).set("plan_age", torch.zeros(3, 2).long())
+        with pytest.raises(ValueError, match=r"'plan_age' must have shape \(3, 1\), got \(3, 2\)"):
+            planner(td)
 
 
 class TestCarriedElites:
@@ -252,7 +390,7 @@ class TestCarriedElites:
             CEM(make_env(), 3, carry_elites=1.5)
         with pytest.raises(ValueError, match="carry_elites must be 0 without warm_start, got 0.5"):
             CEM(make_env(), 3, carry_elites=0.5, warm_start=False)
-        with pytest.raises(ValueError, match="num_candidates must be at least 3 to carry elites, got 2"):
+        with pytest.raises(ValueError, match="carry_elites must be of at most 0 plans, what num_cand"):
             CEM(make_env(), 3, num_candidates=2, carry_elites=0.5)
         planner = CEM(make_env(), 3, 1, 8, 2, carry_elites=1.0)
         td = planner(states())
@@ -283,9 +421,9 @@ class TestDecayingPopulation:
         planner(states())
         assert seen == expected
 
-    def test_never_more_than_there_were(self) -> None:
-        planner = CEM(make_env(), 3, 4, 6, 5, population_decay=0.5, seed=0)
-        assert [planner._population(k) for k in range(3)] == [6, 6, 6]
+    def test_refused_where_nothing_would_decay(self) -> None:
+        with pytest.raises(ValueError, match="population_decay must be 1 where twice top_k is no less than"):
+            CEM(make_env(), 3, 4, 10, 5, population_decay=0.5)
 
     @pytest.mark.parametrize("decay", [0.0, 1.5, math.nan])
     def test_bad_ones_are_refused(self, decay: float) -> None:

@@ -459,7 +459,7 @@ class TestCandidates:
         again = (first[:, :1] == second).flatten(-2).all(-1).any(-1)
         assert again.all() or num == 11, "the best plan is a candidate again"
 
-    @pytest.mark.parametrize(("num", "top_k"), [(1, 2), (4, 2), (9, 2), (9, 6)])
+    @pytest.mark.parametrize(("num", "top_k"), [(1, 2), (4, 2), (8, 2), (1, 5)])
     def test_beside_elites_that_are_carried_and_a_population_that_decays(self, num: int, top_k: int) -> None:
         planner = make_planner(
             Recorder,

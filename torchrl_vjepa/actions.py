@@ -277,7 +277,7 @@ class ActionCodec(nn.Module):
         Returns:
             One tensor for each of :attr:`keys`.
         """
-        if self.is_identity:
+        if self.is_identity and code.dtype == self._leaves[0].dtype:
             return [code.reshape((*code.shape[:-1], *self.shape))]
         return self.decode_leaves(code)
 

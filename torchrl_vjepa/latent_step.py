@@ -17,12 +17,37 @@ from torchrl_vjepa.distributions import Density, point_estimate
 from torchrl_vjepa.priors import LatentDensity, Prior, Task
 from torchrl_vjepa.state_heads import Head, in_evaluation, state_value
 
-__all__ = ["NO_GRADIENT", "LatentStep"]
+__all__ = ["NO_GRADIENT", "LatentStep", "while_alive"]
 
 NO_GRADIENT = (
     "prior must have a gradient for actions that require one, got an energy without: is it detached, rounded "
     "or a comparison? A sampling planner (CEM, MPPI) needs none"
 )
+
+
+def while_alive(alive: Tensor, amount: Tensor) -> Tensor:
+    """What counts as far as an episode lives; behind its certain end nothing does, not even ``nan``.
+
+    Args:
+        alive: probability of being alive, of shape ``(*B)``.
+        amount: what is weighted by it, of shape ``(*B)``.
+
+    Returns:
+        Of shape ``(*B)``.
+
+    Examples:
+        >>> while_alive(torch.tensor([0.5, 0.0]), torch.tensor([2.0, torch.inf]))
+        tensor([1., 0.])
+    """
+    return alive * torch.where(alive > 0, amount, 0.0)
+
+
+def _survival(probability: Tensor) -> Tensor:
+    """Probability of being alive behind each step ``(*B, H)``: zero from the first certain end on."""
+    survival = 1 - probability
+    ended = survival == 0
+    after = ended.cumsum(dim=-1) > ended.long()
+    return torch.where(after, 1.0, survival).cumprod(dim=-1)
 
 
 class LatentStep(TensorDictModuleBase):
@@ -255,9 +280,9 @@ class LatentStep(TensorDictModuleBase):
         if self.termination_model is None:
             return costs
         probability = self.termination_probability(latent, action)
-        alive = (1 - probability).cumprod(dim=-1)
+        alive = _survival(probability)
         alive = torch.cat([torch.ones_like(alive[..., :1]), alive[..., :-1]], dim=-1)
-        return alive * (costs + probability * self.termination_cost)
+        return while_alive(alive, costs + probability * self.termination_cost)
 
     def value_behind(self, head: Head, latent: Tensor, action: Tensor) -> Tensor:
         r"""What trajectories are worth behind their horizon, :math:`\prod_{k=1}^{H} (1 - p_k) \, V(Z_{t+H})`.
@@ -283,7 +308,7 @@ class LatentStep(TensorDictModuleBase):
         )
         if self.termination_model is None:
             return value
-        return (1 - self.termination_probability(latent, action)).prod(dim=-1) * value
+        return while_alive(_survival(self.termination_probability(latent, action))[..., -1], value)
 
     def fused_cost(
         self, latent: Tensor, action: Tensor, log_evidence: Tensor, density: LatentDensity | None = None

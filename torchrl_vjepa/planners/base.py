@@ -53,9 +53,9 @@ class Planner(MPCPlannerBase):
 
     **Memory between steps is in the tensordict.** With ``warm_start`` the planner reads
     ``plan_key`` and ``init_key`` and writes ``("next", plan_key)``, the plan shifted by one step
-    with its last action repeated. Rows with ``init_key`` set, rows with a plan that is all zeros
-    (what the primer gives) or not finite, and inputs without a plan start cold, from the centre of
-    the bounds.
+    with its last action repeated. Rows with ``init_key`` set or a plan that is not finite, and inputs
+    without a plan, start cold, from the centre of the bounds; without ``init_key`` so do rows with a plan
+    that is all zeros, which is what the primer gives.
     ``get_env_transforms_from_module(policy)`` gives the environment what it needs.
 
     **Any action.** Plans are searched in the flat code of :class:`~torchrl_vjepa.actions.ActionCodec`, ``A``
@@ -63,14 +63,14 @@ class Planner(MPCPlannerBase):
     one after the other where there are several. What is executed is decoded: all tensors of the action, in
     the shapes and dtypes of the specification. The entries that hold whole plans (``plan_key``,
     ``("plan_stats", "actions")``, ``std``) have the action's shape for one continuous tensor, and stay in
-    code otherwise. Zeros then are a cold start only without ``init_key``: bits may all be zero in a plan.
-    Masks of the specification (``OneHot``, ``Categorical``) hold for all steps of a plan.
+    code otherwise. Masks of the specification (``OneHot``, ``Categorical``) hold for all steps of a plan.
 
     **Randomness** comes from a generator of the planner's own; the global random state is never
     touched. All rows of a batch see the same noise: planning for many environments at once equals
     planning for each alone from the same generator state, in any order. The generator's state
     travels with pickling and ``copy.deepcopy``: workers of a collector draw the same noise unless
-    :meth:`set_seed` is called in them.
+    :meth:`set_seed` is called in them. Models, values and policies are called in the mode they are in: what
+    they draw in training mode (dropout) is their own.
 
     Args:
         env: a :class:`~torchrl_vjepa.envs.LatentEnv`, or any TorchRL environment that is not
@@ -84,9 +84,9 @@ class Planner(MPCPlannerBase):
         init_std: spread of the proposal after a cold start: a fraction of half the range where the
             action is bounded (0.5 by default), in units of the action where it is not (no default).
         replan_interval: steps of a plan that are executed before the next search, a multiple of
-            ``action_repeat`` and that by default; more than one needs ``warm_start``. How many were is
-            counted in the tensordict, under ``plan_key`` with ``_age`` appended, for each row: the search is
-            left out where no row needs it.
+            ``action_repeat`` and that by default. How many were is counted in the tensordict, under
+            ``plan_key`` with ``_age`` appended, for each row: only rows whose turn it is are searched. The
+            plan is remembered for that even without ``warm_start``.
         action_repeat: steps for which every action of a plan is held, imagined and executed;
             ``planning_horizon`` is a multiple of it. So ``H / action_repeat`` decisions are searched.
         num_samples: trajectories ``M`` imagined for each plan; the environment's way by default.
@@ -174,7 +174,6 @@ class Planner(MPCPlannerBase):
         return_stats: bool | Mapping[str, Risk] = False,
         plan_key: NestedKey = "plan",
         init_key: NestedKey = "is_init",
-        _num_elites: int = 0,
         seed: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
@@ -187,10 +186,10 @@ class Planner(MPCPlannerBase):
             )
         replan_interval = action_repeat if replan_interval is None else replan_interval
         check_counts(replan_interval=replan_interval)
-        if replan_interval > (planning_horizon if warm_start else 1) or replan_interval % action_repeat:
+        if replan_interval > planning_horizon or replan_interval % action_repeat:
             raise ValueError(
-                f"replan_interval must be at most planning_horizon={planning_horizon}, a multiple of "
-                f"action_repeat={action_repeat}, and 1 without warm_start, got {replan_interval}"
+                f"replan_interval must be at most planning_horizon={planning_horizon} and a multiple of "
+                f"action_repeat={action_repeat}, got {replan_interval}"
             )
         if not 0 < warm_std <= 1:
             raise ValueError(f"warm_std must be in (0, 1], got {warm_std}")
@@ -209,7 +208,7 @@ class Planner(MPCPlannerBase):
         self.codec, self.family = codec, family
         # Looked up on the class: a transform around a LatentEnv must be stepped, not bypassed.
         offers_objective = callable(getattr(type(env), "objective", None))
-        self._env_objective = None if offers_objective else EnvObjective(env)
+        self._env_objective = None if offers_objective else EnvObjective(env, codec=codec)
         asked = {"num_samples": num_samples, "risk": risk, "constraints": constraints, "fusion": fusion}
         asked["terminal_value"] = terminal_value
         self._constrained = self._checked_sampling(_given(asked))
@@ -225,35 +224,32 @@ class Planner(MPCPlannerBase):
         self.warm_start, self.warm_std = warm_start, warm_std
         self.return_stats, self.stats_risks = bool(return_stats), self._checked_risks(return_stats)
         self.replan_interval, self.action_repeat = replan_interval, action_repeat
-        self.memory = PlanMemory(
-            codec,
-            planning_horizon,
-            replan_interval,
-            _num_elites,
-            plan_key=plan_key if warm_start else None,
-            init_key=init_key,
-        )
-        own = self._env_objective
-        reads = [*(env.planning_keys if own is None else own.in_keys), *self.memory.in_keys]
-        writes = [*written, *self.memory.out_keys]
-        if replan_interval > 1 and return_stats and self.own_statistics:
-            raise ValueError(
-                f"replan_interval must be 1 for the statistics of {type(self).__name__}, which are of a "
-                f"search in every step, got {replan_interval}"
-            )
-        if return_stats:
-            names = [
-                *_STATISTICS[: None if self._constrained else -1],
-                *self.stats_risks,
-                *self.own_statistics,
-            ]
-            writes += [("plan_stats", name) for name in names]
-        self.in_keys, self.out_keys = reads, writes
+        self._written, self._plan_key, self._init_key = written, plan_key, init_key
+        self._remember(0)
         if generator is None:
             generator = torch.Generator(self.low.device)
             generator.manual_seed(torch.initial_seed() if seed is None else seed)
         self._generator = generator
         self._model_generator = offspring(generator, generator.device)
+
+    def _remember(self, num_elites: int) -> None:
+        """What is read and written, with so many plans carried beside the plan."""
+        remembers = self.warm_start or self.replan_interval > 1
+        self.memory = PlanMemory(
+            self.codec,
+            self.planning_horizon,
+            self.replan_interval,
+            num_elites,
+            plan_key=self._plan_key if remembers else None,
+            init_key=self._init_key,
+        )
+        own = self._env_objective
+        self.in_keys = [*(self.env.planning_keys if own is None else own.in_keys), *self.memory.in_keys]
+        self.out_keys = [*self._written, *self.memory.out_keys]
+        if self.return_stats:
+            constrained = None if self._constrained else -1
+            names = [*_STATISTICS[:constrained], *self.stats_risks, *self.own_statistics]
+            self.out_keys += [("plan_stats", name) for name in names]
 
     @property
     def num_decisions(self) -> int:
@@ -344,7 +340,8 @@ class Planner(MPCPlannerBase):
             written = self.codec.executed(plan.actions[..., 0, :])
             written += self.memory.entries(plan, age)
             if self.return_stats:
-                written += [self.memory.shaped(plan.actions), self.memory.shaped(plan.std)]
+                # A copy: what is done to the executed action is not done to the statistics.
+                written += [self.memory.shaped(plan.actions.clone()), self.memory.shaped(plan.std)]
                 written += self._statistics(state, plan.actions.unsqueeze(-3))
                 written += [plan.statistics[name] for name in self.own_statistics]
         out = tensordict if tensordict_out is None else tensordict_out
@@ -374,18 +371,37 @@ class Planner(MPCPlannerBase):
         self._follow_device()
         recalled = self.memory.recall(tensordict, batch, self.low)
         start = self._start(recalled, batch)
-        if recalled.plan is None or recalled.age is None:
+        if self.replan_interval == 1 or recalled.age is None:
             plan = self._search(state, start, recalled)
         else:
-            # Rows in the middle of a plan go on with it.
-            running = recalled.age > 0
-            stored = self.codec.mode(recalled.plan.clamp(self.low, self.high))
-            std = start.std.repeat_interleave(self.action_repeat, dim=-2)
-            plan = Plan(stored, std, stored, torch.zeros_like(stored[..., 0, 0]), elites=recalled.elites)
-            if not bool(running.all()):
-                plan = plan.where(running, self._search(state, start, recalled))
+            # Each step draws as much, whoever searches: the noise of a row is not a matter of the others.
+            own = self._generator, self._model_generator
+            self._generator, self._model_generator = (offspring(each, each.device) for each in own)
+            try:
+                plan = self._continued(state, start, recalled)
+            finally:
+                self._generator, self._model_generator = own
         warn_of_costs(plan.best_cost, self._constrained)
         return _Found(state, plan, recalled.age)
+
+    def _continued(self, state: Any, start: Proposal, recalled: Recalled) -> Plan:
+        """Rows in the middle of a plan go on with it; the others are searched."""
+        if recalled.plan is None or recalled.age is None or not bool((recalled.age > 0).any()):
+            return self._search(state, start, recalled)
+        stored = self.codec.mode(recalled.plan.clamp(self.low, self.high))
+        std = start.std.repeat_interleave(self.action_repeat, dim=-2)
+        cost = torch.zeros_like(stored[..., 0, 0])
+        plan = Plan(stored, std, stored, cost, self._no_statistics(start), recalled.elites)
+        due = recalled.age == 0
+        if not bool(due.any()):
+            return plan
+        elites = None if recalled.elites is None else recalled.elites[due]
+        parts = Recalled(recalled.plan[due], recalled.warm[due], recalled.age[due], elites)
+        return plan.replaced(due, self._search(state[due], Proposal(start.mean[due], start.std[due]), parts))
+
+    def _no_statistics(self, start: Proposal) -> dict[str, Tensor]:
+        """Values of :attr:`own_statistics` in a step without a search."""
+        return {}
 
     def _search(self, state: Any, start: Proposal, recalled: Recalled) -> Plan:
         """A plan of all steps, from what is remembered."""
@@ -394,7 +410,7 @@ class Planner(MPCPlannerBase):
     def _start(self, recalled: Recalled, batch: torch.Size) -> Proposal:
         """Proposal from the plan of the step before where there is one, else from the bounds."""
         cold = self.family.cold(batch, self.num_decisions)
-        if recalled.plan is None:
+        if recalled.plan is None or not self.warm_start:
             return cold
         start = self.family.around(recalled.plan[..., :: self.action_repeat, :], self.warm_std)
         warm = recalled.warm[..., None, None]
@@ -452,7 +468,9 @@ class Planner(MPCPlannerBase):
 
         def evaluate(candidates: Tensor) -> Tensor:
             costs = objective(candidates, generator)
-            return costs.to(candidates.dtype).nan_to_num(math.inf, math.inf, math.inf)
+            # Never rounded to the dtype of the actions: differences of large costs would be lost.
+            dtype = torch.promote_types(costs.dtype, candidates.dtype)
+            return costs.to(dtype).nan_to_num(math.inf, math.inf, math.inf)
 
         return evaluate
 

@@ -94,7 +94,7 @@ def weighted_gaussian(elites: Tensor, weights: Tensor, previous_mean: Tensor) ->
     """
     batch, num, shape = weights.shape[:-1].numel(), weights.shape[-1], previous_mean.shape
     size = shape[-2:].numel()
-    w = weights.reshape(batch, 1, num)
+    w = weights.reshape(batch, 1, num).to(elites.dtype)
     squares = (elites - previous_mean.unsqueeze(-3)).square_()
     # Products of matrices: a third of the time of sums over the third dimension from the end.
     mean = torch.bmm(w, elites.reshape(batch, num, size)).reshape(shape)

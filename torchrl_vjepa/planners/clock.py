@@ -40,11 +40,13 @@ class Clock:
     """
 
     def __init__(self, max_ms: float | None, reserve: int = 0) -> None:
-        self.end: float | None = None
+        self.end = None if max_ms is None else time.perf_counter() + 1e-3 * max_ms
         self.longest, self.reserve = 0.0, reserve
-        if max_ms is not None:
-            self.last = time.perf_counter()
-            self.end = self.last + 1e-3 * max_ms
+        self.begin()
+
+    def begin(self) -> None:
+        """Rounds begin here; what was done before takes time, but is none of them."""
+        self.last = time.perf_counter() if self.end is not None else 0.0
 
     def another(self, result: Tensor) -> bool:
         """Count one round, which ends when its result is there.

@@ -134,7 +134,10 @@ class DiscretePlanner(Planner):
         asked = {"num_samples": self.num_samples, "risk": self.risk, "constraints": self.constraints}
         asked = {name: value for name, value in asked.items() if value is not None}
         source = self._source
-        if isinstance(source, LatentEnv) and type(source).objective is not LatentEnv.objective:
+        if isinstance(source, LatentEnv) and any(
+            getattr(type(source), name) is not getattr(LatentEnv, name)
+            for name in ("objective", "objective_from")
+        ):
             return False
         if self._env_objective is None and not isinstance(source, LatentEnv):
             return False

@@ -31,6 +31,7 @@ class EnvObjective:
     Args:
         env: the environment; stochastic ones draw from their own random state.
         reward_key: where the reward is; the environment's by default.
+        codec: of its actions, if somebody has one, who then moves it between devices.
 
     Raises:
         ValueError: if the environment is batch-locked, or has several rewards and none is named.
@@ -46,7 +47,9 @@ class EnvObjective:
         torch.Size([5])
     """
 
-    def __init__(self, env: EnvBase, *, reward_key: NestedKey | None = None) -> None:
+    def __init__(
+        self, env: EnvBase, *, reward_key: NestedKey | None = None, codec: ActionCodec | None = None
+    ) -> None:
         if env.batch_locked:
             raise ValueError(
                 "env must accept any batch size to be planned over (batch_locked=False), "
@@ -70,7 +73,7 @@ class EnvObjective:
             reward_key = env.reward_keys[0]
         self.env = env
         self.reward_key = unravel_key(reward_key)
-        self.codec = ActionCodec(env.full_action_spec)
+        self.codec = ActionCodec(env.full_action_spec) if codec is None else codec
         # A LatentEnv's model reads the code of the action, which the environment makes itself.
         code_key = getattr(getattr(base, "world_model", None), "action_key", None)
         own = {code_key, *self.codec.keys, *map(unravel_key, (*env.done_keys, *env.reward_keys))}

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from torchrl_vjepa.latent_step import while_alive
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
 from torchrl_vjepa.planners.plan import Plan, check_counts
@@ -127,7 +128,7 @@ class ExhaustiveSearch(DiscretePlanner):
                 value = state_value(
                     self.terminal_value, entries(state), cost.shape, latent_key_of(self._source)
                 )
-                cost = cost - state[ALIVE] * value.to(cost.dtype)
+                cost = cost - while_alive(state[ALIVE], value).to(cost.dtype)
             return torch.where(cost.isfinite(), cost, torch.inf).min(dim=1)
         n = self.num_actions
         size = width if self.chunk_size is None else max(1, self.chunk_size // n)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_vjepa.belief import ParticleBelief, PreparedTransition, rollout
 from torchrl_vjepa.envs import LatentEnv
+from torchrl_vjepa.latent_step import while_alive
 from torchrl_vjepa.planners.env_objective import EnvObjective
 
 __all__ = [
@@ -144,8 +145,8 @@ class LatentExpansion:
         cost = model.stage_cost(latent, action, task)
         if model.termination_model is not None:
             end = model.termination_probability(latent, action)
-            cost = alive * (cost + end * model.termination_cost)
-            alive = alive * (1 - end)
+            cost = while_alive(alive, cost + end * model.termination_cost)
+            alive = while_alive(alive, 1 - end)
         return {**moved, ALIVE: alive}, cost
 
     def move(self, state: State, action: Tensor) -> State:

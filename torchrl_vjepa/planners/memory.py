@@ -78,8 +78,6 @@ class PlanMemory:
     ) -> None:
         self.horizon, self.interval, self.num_elites = horizon, interval, num_elites
         self.shape, self.size = tuple(codec.shape), codec.size
-        # Bits may all be zero in a plan; numbers that are all zero are what a primer gives.
-        self._zero_is_cold = codec.is_continuous
         self._init_key = unravel_key(init_key)
         self.keys: dict[str, NestedKey] = {}
         if plan_key is not None:
@@ -128,11 +126,17 @@ class PlanMemory:
             age = warm.long() if self.interval > 1 else None
             return Recalled(None, warm, age, None)
         is_init = tensordict.get(self._init_key, None)
-        plan, warm = remembered(plan, is_init, zero_is_cold=self._zero_is_cold)
+        plan, warm = remembered(plan, is_init)
         age = elites = None
         if self.interval > 1:
             age = tensordict.get(self.keys["age"], None)
-            age = warm.long() * 0 if age is None else torch.where(warm, age.reshape(batch), 0)
+            if age is None:
+                age = torch.zeros_like(warm, dtype=torch.int64)
+            elif tuple(age.shape) not in ((*batch, 1), tuple(batch)):
+                raise ValueError(
+                    f"{self.keys['age']!r} must have shape {(*batch, 1)}, got {tuple(age.shape)}"
+                )
+            age = torch.where(warm, age.reshape(batch), 0)
         if self.num_elites:
             elites = self._plans(tensordict, "elites", (*batch, self.num_elites), like)
             if elites is not None:

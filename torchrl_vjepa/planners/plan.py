@@ -62,27 +62,39 @@ class Plan(NamedTuple):
             elites=elites,
         )
 
-    def where(self, rows: Tensor, other: Plan) -> Plan:
-        """The plan in some rows, another in the rest.
+    def replaced(self, rows: Tensor, found: Plan) -> Plan:
+        """The plan with other plans in some rows.
 
         Args:
-            rows: flags of shape ``(*B)``.
-            other: of the same shapes; its statistics are taken, and its elites where this plan has none.
+            rows: flags of shape ``(*B)``, ``R`` of them set.
+            found: of those rows, with batch ``(R)``; its statistics are zero in the others, and where this
+                plan has no elites they are the plan itself there.
 
         Returns:
-            The plan.
+            The plan, with batch ``*B``.
         """
-        elites = other.elites
-        if elites is not None and self.elites is not None:
-            elites = torch.where(rows[..., None, None, None], self.elites, elites)
-        wide = rows[..., None, None]
-        return other._replace(
-            actions=torch.where(wide, self.actions, other.actions),
-            std=torch.where(wide, self.std, other.std),
-            best=torch.where(wide, self.best, other.best),
-            best_cost=torch.where(rows, self.best_cost, other.best_cost),
-            elites=elites,
+        elites = found.elites
+        if elites is not None:
+            own = self.actions.unsqueeze(-3) if self.elites is None else self.elites
+            elites = _scattered(own.expand(*rows.shape, *elites.shape[1:]), rows, elites)
+        statistics = {
+            name: _scattered(value.new_zeros(*rows.shape, *value.shape[1:]), rows, value)
+            for name, value in found.statistics.items()
+        }
+        return Plan(
+            _scattered(self.actions, rows, found.actions),
+            _scattered(self.std, rows, found.std),
+            _scattered(self.best, rows, found.best),
+            _scattered(self.best_cost.to(found.best_cost.dtype), rows, found.best_cost),
+            statistics,
+            elites,
         )
+
+
+def _scattered(whole: Tensor, rows: Tensor, part: Tensor) -> Tensor:
+    whole = whole.clone()
+    whole[rows] = part
+    return whole
 
 
 def check_counts(**counts: int) -> None:
@@ -102,28 +114,28 @@ def check_counts(**counts: int) -> None:
             raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
 
 
-def remembered(plan: Tensor, is_init: Tensor | None, *, zero_is_cold: bool) -> tuple[Tensor, Tensor]:
+def remembered(plan: Tensor, is_init: Tensor | None) -> tuple[Tensor, Tensor]:
     """The rows of a plan from the step before that are one.
 
     Args:
-        plan: of shape ``(*B, H, A)``; not finite, or all zeros (what a primer gives), where there is none.
-        is_init: where an episode begins, ``(*B)`` or ``(*B, 1)``: there is none either.
-        zero_is_cold: whether a plan of zeros is none although ``is_init`` is known.
+        plan: of shape ``(*B, H, A)``; not finite where there is none.
+        is_init: where an episode begins, ``(*B)`` or ``(*B, 1)``: there is none either. If that is not known,
+            there is none where the plan is all zeros, which is what a primer gives.
 
     Returns:
         The plan, zero in rows without one, and whether a row has one, ``(*B)``.
 
     Examples:
         >>> plan = torch.tensor([[[1.0]], [[float("nan")]], [[2.0]]])
-        >>> remembered(plan, torch.tensor([False, False, True]), zero_is_cold=True)[1]
+        >>> remembered(plan, torch.tensor([False, False, True]))[1]
         tensor([ True, False, False])
     """
     rows = plan.flatten(-2)
     warm = rows.isfinite().all(dim=-1)
     if is_init is not None:
         warm = warm & ~is_init.reshape(warm.shape).bool()
-    if is_init is None or zero_is_cold:
-        warm = warm & (rows != 0).any(dim=-1)  # bits may all be zero in a plan
+    else:
+        warm = warm & (rows != 0).any(dim=-1)
     return torch.where(warm[..., None, None], plan, 0.0), warm
 
 

@@ -61,17 +61,19 @@ class SamplingPlanner(Planner):
         antithetic: draw noise in pairs of opposite sign.
         chunk_size: candidates (of every row) that are imagined at a time; all by default. The memory of a
             plan is at most that of one with ``num_candidates=chunk_size``, and ten times the candidates
-            ``(*B, N, H, A)``; the plan is the same up to rounding, except in environments that draw their own
-            noise.
+            ``(*B, N, H, A)``, beside what a ``policy`` computes for its plans; the plan is the same up to
+            rounding, except in environments that draw their own noise.
         max_ms: time for a plan, in milliseconds: no round begins that would end later, if it took as long as
-            the longest before it. The first always runs; the plan is that of the rounds that did. Waits for
-            the device after each round, and how far planning gets depends on the machine and the batch size.
+            the longest before it. A policy's plans and the first round always run; the plan is that of the
+            rounds that did. Waits for the device after each round, and how far planning gets depends on the
+            machine and the batch size.
         output: the plan is the ``"mean"`` of the proposal (where actions are discrete its most probable
             plan), or the ``"best"`` candidate seen.
         noise_beta: colour of the noise along a plan, from 0 (white: every step is drawn alone) to 4: with a
             power spectrum of :math:`1/f^\beta` candidates hold a direction, or a choice, for some time
             (:func:`~torchrl_vjepa.planners.noise.coloured_noise_factor`).
-        keep_elites: fraction of the elites that are candidates again in the next round.
+        keep_elites: fraction of the elites that are candidates again in the next round, beside the best,
+            which always is.
         carry_elites: fraction of the last round's elites that are candidates in the first round of the next
             step, one step on; needs ``warm_start``. They are carried in the tensordict, under ``plan_key``
             with ``_elites`` appended.
@@ -165,16 +167,18 @@ class SamplingPlanner(Planner):
             raise ValueError(f"carry_elites must be 0 without warm_start, got {carry_elites}")
         if not 0 < population_decay <= 1:
             raise ValueError(f"population_decay must be in (0, 1], got {population_decay}")
-        carried = min(math.ceil(carry_elites * top_k), num_candidates - 2)
-        if carry_elites and carried < 1:
-            raise ValueError(f"num_candidates must be at least 3 to carry elites, got {num_candidates}")
+        if population_decay < 1 and 2 * top_k >= num_candidates:
+            raise ValueError(
+                "population_decay must be 1 where twice top_k is no less than num_candidates="
+                f"{num_candidates}, got {population_decay} with top_k={top_k}"
+            )
         if num_policy_candidates is not None:
             check_counts(num_policy_candidates=num_policy_candidates)
             if policy is None:
                 raise ValueError(
                     f"num_policy_candidates must be None without a policy, got {num_policy_candidates}"
                 )
-        super().__init__(env, planning_horizon, optim_steps, _num_elites=max(0, carried), **kwargs)
+        super().__init__(env, planning_horizon, optim_steps, **kwargs)
         self.policy: Any = policy
         self.num_policy_candidates = 0
         if policy is not None:
@@ -182,16 +186,22 @@ class SamplingPlanner(Planner):
             self.num_policy_candidates = policy_candidates(
                 source, env, self.codec, policy, num_policy_candidates, num_candidates
             )
-            read = [] if self._env_objective is None else self._env_objective.in_keys
-            self.in_keys = list(dict.fromkeys([*self.in_keys, *read]))
+        # The mean and the best plan are candidates always.
+        self._num_free = max(0, num_candidates - self.num_policy_candidates - 2)
+        carried = math.ceil(carry_elites * top_k)
+        if carried > self._num_free:
+            raise ValueError(
+                f"carry_elites must be of at most {self._num_free} plans, what num_candidates="
+                f"{num_candidates} have room for, got {carry_elites} of top_k={top_k}"
+            )
+        self._remember(carried)
         self.chunk_size, self.max_ms = chunk_size, max_ms
         self.num_candidates, self.top_k = num_candidates, top_k
         self.min_std, self.antithetic, self.output = min_std, antithetic, output
         self.noise_beta, self.keep_elites, self.carry_elites = noise_beta, keep_elites, carry_elites
         self.population_decay = population_decay
         # The best plan is a candidate again anyway, so it is the next ones that are kept.
-        self._num_free = max(0, num_candidates - self.num_policy_candidates - 2)
-        self._num_kept = min(int(keep_elites * top_k), top_k - 1, self._num_free)
+        self._num_kept = min(math.ceil(keep_elites * top_k), top_k - 1, self._num_free)
         colour = coloured_noise_factor(self.num_decisions, noise_beta) if noise_beta else None
         self.register_buffer("_colour", None if colour is None else colour.to(self.low), persistent=False)
 
@@ -230,8 +240,9 @@ class SamplingPlanner(Planner):
         generator, top_k, constrained = self._model_generator, self.top_k, self._constrained
         model_state = generator.get_state()
         evaluate = self._evaluator(state)
-        acted = self._policy_plans(state, proposal)
         clock = Clock(self.max_ms)
+        acted = self._policy_plans(state, proposal)
+        clock.begin()
         kept = None if suggested is None else suggested[..., : self._num_free, :, :]
         for round_ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules.mcts import MCTSScore, PUCTScore
 
+from torchrl_vjepa.latent_step import while_alive
 from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
@@ -75,11 +76,13 @@ class TreeSearch(DiscretePlanner):
             is weighted by the predicted probability of being alive. Rollouts that end in a value instead take
             ``terminal_value``.
         max_ms: time for a plan, in milliseconds: no simulation begins that would end later, if it took as
-            long as the longest before it; the plan is that of those that ran.
+            long as the longest before it; the plan is that of those that ran. What is known of a warm start,
+            and one simulation, always run.
         output: the plan is the principal variation of ``"visits"``, or the ``"best"`` simulation.
         return_stats: also writes ``("plan_stats", "visits")``, of the actions at the root, ``(*B, n)``, and
             ``("plan_stats", "value")``, minus the mean cost of the simulations, ``(*B, 1)``.
-            ``("plan_stats", "std")`` is the spread of the visits along the plan.
+            ``("plan_stats", "std")`` is the spread of the visits along the plan. Zero in rows that execute a
+            plan (``replan_interval``); the value is ``nan`` where no simulation has a finite cost.
         **kwargs: see :class:`Planner`.
 
     Raises:
@@ -174,20 +177,20 @@ class TreeSearch(DiscretePlanner):
         Returns:
             The plan. ``best`` is the cheapest simulation, whose cost contains the leaf's value.
         """
+        clock = Clock(self.max_ms)
         batch = proposal.mean.shape[:-2]
         shape = (self.num_simulations, self.num_decisions, self.num_actions)
         noise = proposal.mean.new_empty(shape).exponential_(generator=self._generator).log().neg()
         if not batch.numel():
-            empty = proposal.mean.new_zeros(*batch, self.num_actions)
-            statistics = {"visits": empty, "value": empty[..., :1]}
-            return Plan(*proposal, proposal.mean, empty[..., 0], statistics)
+            statistics = self._no_statistics(proposal)
+            return Plan(*proposal, proposal.mean, proposal.mean[..., 0, 0], statistics)
         index, warm = self._numbered(proposal)
         any_warm = bool(warm.any())
         room = 1 + self.num_simulations + self.num_decisions * any_warm
         search = _Search(self, self._expansion(state), room)
         if any_warm:
             search.follow(index, warm)
-        clock = Clock(self.max_ms)
+        clock.begin()
         for gumbel in noise:
             search.simulate(gumbel)
             if not clock.another(search.best_cost):
@@ -215,6 +218,10 @@ class TreeSearch(DiscretePlanner):
             shaped(search.best_cost),
             {name: shaped(part) for name, part in statistics.items()},
         )
+
+    def _no_statistics(self, start: Proposal) -> dict[str, Tensor]:
+        visits = start.mean.new_zeros(*start.mean.shape[:-2], self.num_actions)
+        return {"visits": visits, "value": torch.zeros_like(visits[..., :1])}
 
 
 class _Search:
@@ -324,7 +331,7 @@ class _Search:
         if head is None:
             return 0.0
         value = state_value(head, entries(state), alive.shape, self.latent_key, name=name)
-        return -self._weight(depth) * (alive * value).to(self.paid.dtype)
+        return -self._weight(depth) * while_alive(alive, value).to(self.paid.dtype)
 
     def _weight(self, step: int | Tensor) -> Tensor | float:
         discount = self.planner.discount**self.planner.action_repeat
