@@ -26,14 +26,14 @@ from torchrl.data import (
     TensorSpec,
     Unbounded,
 )
-from torchrl.envs import EnvBase, GymEnv
+from torchrl.envs import EnvBase, GymEnv, PendulumEnv
 from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SoftUpdate
 
 from torchrl_vjepa.actions import ActionCodec, ActionEncoder
 from torchrl_vjepa.baselines import PixelAR, PixelARLoss, PixelDecoder
-from torchrl_vjepa.costs import QuadraticReward
+from torchrl_vjepa.costs import QuadraticReward, quadratic_cost
 from torchrl_vjepa.distributions import Delta
 from torchrl_vjepa.encoders import linear_encoder
 from torchrl_vjepa.envs import LatentEnv
@@ -468,3 +468,21 @@ class TestTraining:
         out = CEM(env, 2, 2, 8, seed=0)(TensorDict(latent=torch.ones(2, 3), batch_size=2))
         assert out["action"].shape == (2, 2)
         assert math.prod(MultiOneHot([2, 3]).shape) == env.codec.size
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_a_planner_of_another_dtype_executes_actions_of_the_specification(dtype: torch.dtype) -> None:
+    spec = Bounded(-1, 1, (2,))
+    env = LatentEnv(
+        lambda latent, action: Delta(latent + action),
+        action_spec=spec,
+        cost=quadratic_cost(torch.full((2,), 3.0)),
+        latent_dim=2,
+    )
+    action = CEM(env, 3, seed=0).to(dtype)(TensorDict(latent=torch.zeros(2)))["action"]
+    assert spec.is_in(action)
+
+
+def test_a_planner_and_what_it_steps_share_one_codec() -> None:
+    planner = CEM(PendulumEnv(), 3)
+    assert planner._env_objective.codec is planner.codec

@@ -267,6 +267,20 @@ def test_scale_and_shift_of_the_cost_do_not_change_cem(spec: TensorSpec, power: 
         assert torch.equal(one[key], two[key])
 
 
+@pytest.mark.parametrize("cls", [CEM, MPPI, GradientMPC])
+def test_large_costs_keep_their_differences(cls: type[Planner]) -> None:
+    """Of a model in float64 with actions in float32: costs are in the dtype that they are computed in."""
+
+    def distance(latent: Tensor, action: Tensor) -> Tensor:
+        return (latent[..., 0] - 0.02).square() + 1e9
+
+    env = LatentEnv(drift, action_spec=Bounded(-1, 1, (1,)), cost=distance, latent_dim=1, dtype=torch.float64)
+    td = TensorDict(latent=torch.zeros(1, dtype=torch.float64))
+    action = cls(env, 1, seed=0)(td)["action"]
+    torch.testing.assert_close(action, torch.tensor([0.2027]), atol=0.05, rtol=0)
+    assert action.dtype == torch.float32
+
+
 @settings(max_examples=30)
 @given(spec=specs(), power=st.integers(-20, 20), shift=st.integers(-1000, 1000))
 def test_they_change_mppi_through_its_temperature_alone(spec: TensorSpec, power: int, shift: int) -> None:

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import Bounded
+from torchrl.data import Bounded, OneHot
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_vjepa import (
@@ -18,9 +18,11 @@ from torchrl_vjepa import (
     VJEPA,
     Delta,
     EnvObjective,
+    ExhaustiveSearch,
     LatentEnv,
     Predictor,
     TerminationLoss,
+    TreeSearch,
     diag_gaussian,
     linear_encoder,
 )
@@ -52,7 +54,8 @@ def one(latent: Tensor, action: Tensor) -> Tensor:
 def make_env(sharpness: float = 1e4, model: Any = walk, **kwargs: Any) -> LatentEnv:
     head = TensorDictModule(Edge(sharpness), ["latent"], ["termination_logit"])
     kwargs.setdefault("cost", one)
-    return LatentEnv(model, action_spec=Bounded(-1, 1, (1,)), latent_dim=1, termination_model=head, **kwargs)
+    kwargs.setdefault("action_spec", Bounded(-1, 1, (1,)))
+    return LatentEnv(model, latent_dim=1, termination_model=head, **kwargs)
 
 
 class TestPlanning:
@@ -242,3 +245,48 @@ class TestLoss:
         data["next", "crashed"] = data["next"].pop("terminated")
         loss.set_keys(terminated=("next", "crashed"))
         torch.testing.assert_close(loss(data)["loss_termination"], expected)
+
+
+class TestBehindACertainEnd:
+    """Nothing counts there, were it infinite or no number."""
+
+    @staticmethod
+    def explosive(factor: float, **kwargs: Any) -> LatentEnv:
+        def explode(latent: Tensor, action: Tensor) -> Delta:
+            return Delta(factor * (latent.abs() + 2))
+
+        def square(latent: Tensor, action: Tensor) -> Tensor:
+            return latent[..., 0].square()
+
+        return make_env(
+            model=explode,
+            cost=square,
+            action_spec=OneHot(2, dtype=torch.float32),
+            termination_cost=7.0,
+            **kwargs,
+        )
+
+    @pytest.mark.parametrize("factor", [1e12, 1e20])  # squares overflow, latents themselves
+    def test_plans_cost_what_they_did_before(self, factor: float) -> None:
+        env = self.explosive(factor)
+        plans = torch.eye(2)[:, None].expand(2, 5, 2)
+        cost = env.objective(torch.zeros(1), plans)
+        if factor == 1e12:
+            assert (cost == (2 * torch.tensor(factor)).square() + 7.0).all()
+        assert not cost.isnan().any()
+        value = env.objective(torch.zeros(1), plans, terminal_value=lambda z: z[..., 0] * torch.nan)
+        torch.testing.assert_close(value, cost)
+
+    @pytest.mark.parametrize("cls", [CEM, ExhaustiveSearch, TreeSearch])
+    def test_every_planner_sees_the_same(self, cls: type[Any]) -> None:
+        env = self.explosive(1e12)
+        planner = cls(env, 5, seed=0, return_stats=True, terminal_value=lambda z: z[..., 0] * torch.nan)
+        out = planner(TensorDict(latent=torch.zeros(1)))
+        plan = planner.plan(torch.zeros(1), planner.family.cold((), 5))
+        expected = (2 * torch.tensor(1e12)).square() + 7.0
+        torch.testing.assert_close(plan.best_cost, expected)
+        torch.testing.assert_close(out["plan_stats", "cost"], expected[None])
+
+    def test_before_it_faults_are_faults(self) -> None:
+        env = make_env(sharpness=1.0, cost=lambda latent, action: latent[..., 0] * torch.nan)
+        assert env.objective(torch.zeros(1), torch.ones(1, 3, 1)).isnan().all()

@@ -33,6 +33,7 @@ from torchrl.modules.mcts import EXP3Score, PUCTScore, UCBScore
 
 from torchrl_vjepa import GoalPrior
 from torchrl_vjepa.actions import ActionCodec
+from torchrl_vjepa.costs import quadratic_cost
 from torchrl_vjepa.distributions import Delta, diag_gaussian
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners import ExhaustiveSearch, Planner, Proposal, TreeSearch
@@ -815,3 +816,24 @@ class TestArguments:
     def test_a_function_of_latents_needs_latents(self) -> None:
         with pytest.raises(TypeError, match="leaf_value must be a TensorDictModule for Walk"):
             TreeSearch(Walk(), 3, leaf_value=value_of)
+
+
+class Negated(LatentEnv):
+    """Overrides what planners call, and nothing else."""
+
+    def objective_from(self, state: Any, **settings: Any) -> Any:
+        evaluate = super().objective_from(state, **settings)
+        return lambda actions, generator=None: -evaluate(actions, generator)
+
+
+def test_an_objective_of_ones_own_is_not_bypassed() -> None:
+    env = Negated(
+        lambda latent, action: Delta(latent + action[..., 1:] - action[..., :1]),
+        action_spec=OneHot(2),
+        cost=quadratic_cost(torch.tensor([3.0])),
+        latent_dim=1,
+    )
+    td = TensorDict(latent=torch.zeros(1))
+    assert ExhaustiveSearch(env, 2)(td.clone())["action"].tolist() == [True, False]
+    with pytest.raises(ValueError, match="env must predict one next state for tree search"):
+        TreeSearch(env, 2)

@@ -15,31 +15,14 @@ from torchrl_vjepa.belief import Transition
 from torchrl_vjepa.costs import StageCost
 from torchrl_vjepa.distributions import Density, point_estimate
 from torchrl_vjepa.priors import LatentDensity, Prior, Task
-from torchrl_vjepa.state_heads import Head, in_evaluation, state_value
+from torchrl_vjepa.state_heads import Head, in_evaluation, state_value, while_alive
 
-__all__ = ["NO_GRADIENT", "LatentStep", "while_alive"]
+__all__ = ["NO_GRADIENT", "LatentStep"]
 
 NO_GRADIENT = (
     "prior must have a gradient for actions that require one, got an energy without: is it detached, rounded "
     "or a comparison? A sampling planner (CEM, MPPI) needs none"
 )
-
-
-def while_alive(alive: Tensor, amount: Tensor) -> Tensor:
-    """What counts as far as an episode lives; behind its certain end nothing does, not even ``nan``.
-
-    Args:
-        alive: probability of being alive, of shape ``(*B)``.
-        amount: what is weighted by it, of shape ``(*B)``.
-
-    Returns:
-        Of shape ``(*B)``.
-
-    Examples:
-        >>> while_alive(torch.tensor([0.5, 0.0]), torch.tensor([2.0, torch.inf]))
-        tensor([1., 0.])
-    """
-    return alive * torch.where(alive > 0, amount, 0.0)
 
 
 def _survival(probability: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-__all__ = ["Head", "call_head", "check_head", "in_evaluation", "state_value"]
+__all__ = ["Head", "call_head", "check_head", "in_evaluation", "state_value", "while_alive"]
 
 Head: TypeAlias = "Callable[[Tensor], Tensor] | TensorDictModuleBase"
 
@@ -148,6 +148,23 @@ def state_value(
             "rounded or a comparison? A sampling planner (CEM, MPPI) needs none"
         )
     return value
+
+
+def while_alive(alive: Tensor, amount: Tensor) -> Tensor:
+    """What counts as far as an episode lives; behind its certain end nothing does, not even ``nan``.
+
+    Args:
+        alive: probability of being alive, of shape ``(*B)``.
+        amount: what is weighted by it, of shape ``(*B)``.
+
+    Returns:
+        Of shape ``(*B)``.
+
+    Examples:
+        >>> while_alive(torch.tensor([0.5, 0.0]), torch.tensor([2.0, torch.inf]))
+        tensor([1., 0.])
+    """
+    return alive * torch.where(alive > 0, amount, 0.0)
 
 
 @contextlib.contextmanager

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from torchrl_vjepa.latent_step import while_alive
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
 from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.source import latent_key_of
-from torchrl_vjepa.state_heads import state_value
+from torchrl_vjepa.state_heads import state_value, while_alive
 
 __all__ = ["ExhaustiveSearch"]
 

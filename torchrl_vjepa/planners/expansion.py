@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchrl_vjepa.belief import ParticleBelief, PreparedTransition, rollout
 from torchrl_vjepa.envs import LatentEnv
-from torchrl_vjepa.latent_step import while_alive
 from torchrl_vjepa.planners.env_objective import EnvObjective
+from torchrl_vjepa.state_heads import while_alive
 
 __all__ = [
     "ALIVE",

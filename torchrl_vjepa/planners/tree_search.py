@@ -11,7 +11,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules.mcts import MCTSScore, PUCTScore
 
-from torchrl_vjepa.latent_step import while_alive
 from torchrl_vjepa.planners.clock import Clock, check_max_ms
 from torchrl_vjepa.planners.discrete import DiscretePlanner
 from torchrl_vjepa.planners.expansion import ALIVE, Expansion, State, entries
@@ -19,7 +18,7 @@ from torchrl_vjepa.planners.plan import Plan, check_counts
 from torchrl_vjepa.planners.proposal import Proposal
 from torchrl_vjepa.planners.search_tree import SearchTree
 from torchrl_vjepa.planners.source import admit_head, latent_key_of
-from torchrl_vjepa.state_heads import Head, call_head, state_value
+from torchrl_vjepa.state_heads import Head, call_head, state_value, while_alive
 
 __all__ = ["TreeSearch"]
 
