@@ -253,7 +253,8 @@ class TestBehindACertainEnd:
     @staticmethod
     def explosive(factor: float, **kwargs: Any) -> LatentEnv:
         def explode(latent: Tensor, action: Tensor) -> Delta:
-            return Delta(factor * (latent.abs() + 2))
+            following = factor * (latent.abs() + 2)
+            return Delta(torch.where(following.isinf(), torch.nan, following))
 
         def square(latent: Tensor, action: Tensor) -> Tensor:
             return latent[..., 0].square()
