@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.envs import RewardScaling, TransformedEnv
 
 from torchrl_vjepa import (
@@ -18,6 +18,7 @@ from torchrl_vjepa import (
     MPPI,
     ChanceConstraint,
     EnergyPrior,
+    ExhaustiveSearch,
     FusedPredictor,
     GaussianPrior,
     GradientMPC,
@@ -31,6 +32,7 @@ from torchrl_vjepa import (
     PseudoLikelihood,
     RandomShooting,
     RegionPrior,
+    TreeSearch,
     trajectory_prior,
 )
 from torchrl_vjepa.costs import action_cost, prior_cost, quadratic_cost
@@ -128,6 +130,19 @@ class TestWhatRoundsShare:
         assert len(prior.calls) == (4 if time_indexed and "propose" in name else 1)
         assert out["action"].isfinite().all()
         assert prior.encoder.weight.grad is None
+
+    @pytest.mark.parametrize("time_indexed", [False, True])
+    def test_searches_over_choices_too(self, time_indexed: bool) -> None:
+        prior = Encoded()
+        spec = Categorical(1)
+        env = make_env(prior, how="mean", action_spec=spec)
+        shape = (3, 6, 2) if time_indexed else (3, 2)
+        goal = torch.randn(shape, dtype=torch.float64)
+        td = TensorDict(latent=torch.randn(3, 2, dtype=torch.float64), goal=goal, batch_size=3)
+        for planner, steps in ((ExhaustiveSearch(env, 4), 4), (TreeSearch(env, 4, 2, seed=0), 7)):
+            prior.calls.clear()
+            planner(td.clone())
+            assert len(prior.calls) == (steps if time_indexed else 1)
 
     @pytest.mark.parametrize("fusion", ["energy", "weight", "propose"])
     @pytest.mark.parametrize("ends", [False, True])

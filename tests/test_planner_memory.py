@@ -357,6 +357,12 @@ class TestCarriedElites:
         expected[-2] = torch.tensor([1.0, 0.0])
         assert torch.equal(candidates, expected)
 
+    def test_suggestions_of_another_length_are_refused(self) -> None:
+        planner = CEM(make_env(), 3, 1, 8, seed=0)
+        start = planner.family.cold((3,), 3)
+        with pytest.raises(ValueError, match=r"suggested must be plans of shape \(3, 2\), got \(2, 2\)"):
+            planner.plan(states()["latent"], start, torch.zeros(3, 1, 2, 2))
+
     def test_a_good_suggestion_is_found(self) -> None:
         planner = RandomShooting(make_env(), 3, num_candidates=8, seed=0)
         best = ((GOAL - states()["latent"]) / 0.9).clamp(-1, 1).unsqueeze(1).expand(-1, 3, -1)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_vjepa.belief import ParticleBelief, PreparedTransition, rollout
 from torchrl_vjepa.envs import LatentEnv
 from torchrl_vjepa.planners.env_objective import EnvObjective
+from torchrl_vjepa.priors import LatentDensity
 from torchrl_vjepa.state_heads import while_alive
 
 __all__ = [
@@ -120,6 +121,7 @@ class LatentExpansion:
         latent = latent.reshape(-1, latent.shape[-1])
         self.root: State = {env.latent_key: latent, ALIVE: torch.ones_like(latent[:, 0])}
         self.tasks: State = {}
+        self._densities: dict[int, LatentDensity] = {}  # by dimensions behind the rows
         if not isinstance(state, Tensor) and env.task_keys:
             tasks = env.world_model.prior.along(state.get("tasks"), len(batch), horizon)
             self.tasks = {
@@ -141,8 +143,8 @@ class LatentExpansion:
         moved = self.move(state, action)
         latent = moved[self.env.latent_key]
         action = action.to(latent.dtype)
-        task = self._tasks_at(step, latent.ndim - 2) if self.tasks else None
-        cost = model.stage_cost(latent, action, task)
+        density = None if model.prior is None else self._density(step, latent)
+        cost = model.stage_cost(latent, action, density=density)
         if model.termination_model is not None:
             end = model.termination_probability(latent, action)
             cost = while_alive(alive, cost + end * model.termination_cost)
@@ -164,6 +166,17 @@ class LatentExpansion:
         plan = action.to(latent.dtype).unsqueeze(-2)
         moved = rollout(self.transition, latent, plan, "mode" if env.how == "mode" else "mean")
         return {**state, env.latent_key: moved.squeeze(-2).to(latent.dtype)}
+
+    def _density(self, step: int | Tensor, latent: Tensor) -> LatentDensity:
+        """What the prior gives for the tasks of a step; once, where they are the same in all steps."""
+        extra = latent.ndim - 2
+        if extra in self._densities:
+            return self._densities[extra]
+        task = self._tasks_at(step, extra) if self.tasks else None
+        density = self.env.world_model.prior.density(latent.shape[-1], task)
+        if all(task.shape[1] == 1 for task in self.tasks.values()):
+            self._densities[extra] = density
+        return density
 
     def _tasks_at(self, step: int | Tensor, extra: int) -> State:
         """Tasks of a step, ``(R, *1, *task)``: they broadcast against ``(R, *X)``."""

@@ -234,6 +234,11 @@ class SamplingPlanner(Planner):
             The plan. No value leaves the device.
         """
         codec, confine = self.codec, self.family.confinement(self.min_std)
+        if suggested is not None and suggested.shape[-2:] != proposal.mean.shape[-2:]:
+            raise ValueError(
+                f"suggested must be plans of shape {tuple(proposal.mean.shape[-2:])}, got "
+                f"{tuple(suggested.shape[-2:])}"
+            )
         best = codec.mode(proposal.mean)
         # Costs keep the dimensions of a plan, (*B, 1, 1): they choose between plans.
         best_cost = infinite = best.new_full((*best.shape[:-2], 1, 1), math.inf)
