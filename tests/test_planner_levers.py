@@ -30,6 +30,7 @@ from torchrl_vjepa.heads import (
     LowRankGaussianHead,
 )
 from torchrl_vjepa.planners import CEM, Proposal, SamplingPlanner, TreeSearch
+from torchrl_vjepa.planners.clock import Clock
 
 HEADS: dict[str, Callable[[], Head]] = {
     "delta": DeltaHead,
@@ -305,6 +306,17 @@ class TestTime:
         monkeypatch.setattr(time, "perf_counter", lambda: 0.01 * next(ticks))
         short = MPPI(make_env(), 3, 8, 16, seed=0, max_ms=21.0)(states())
         assert torch.equal(short["action"], MPPI(make_env(), 3, 2, 16, seed=0)(states())["action"])
+
+    def test_what_comes_before_the_rounds_takes_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        now = [0.0]
+        monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+        clock = Clock(35.0)
+        now[0] = 0.020  # a policy has suggested plans
+        clock.begin()
+        now[0] = 0.027
+        assert clock.another(torch.zeros(1))  # 27 + 7 is less than 35
+        now[0] = 0.029
+        assert not clock.another(torch.zeros(1))  # 29 + 7 is not
 
     @pytest.mark.parametrize(("max_ms", "simulations"), [(5.0, 1), (39.0, 3), (1000.0, 12), (None, 12)])
     def test_tree_search_too(

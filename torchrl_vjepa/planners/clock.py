@@ -40,13 +40,14 @@ class Clock:
     """
 
     def __init__(self, max_ms: float | None, reserve: int = 0) -> None:
-        self.end = None if max_ms is None else time.perf_counter() + 1e-3 * max_ms
+        self.last = 0.0 if max_ms is None else time.perf_counter()
+        self.end = None if max_ms is None else self.last + 1e-3 * max_ms
         self.longest, self.reserve = 0.0, reserve
-        self.begin()
 
     def begin(self) -> None:
         """Rounds begin here; what was done before takes time, but is none of them."""
-        self.last = time.perf_counter() if self.end is not None else 0.0
+        if self.end is not None:
+            self.last = time.perf_counter()
 
     def another(self, result: Tensor) -> bool:
         """Count one round, which ends when its result is there.

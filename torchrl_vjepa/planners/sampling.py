@@ -247,7 +247,8 @@ class SamplingPlanner(Planner):
         evaluate = self._evaluator(state)
         clock = Clock(self.max_ms)
         acted = self._policy_plans(state, proposal)
-        clock.begin()
+        if acted is not None:
+            clock.begin()
         kept = None if suggested is None else suggested[..., : self._num_free, :, :]
         for round_ in range(self.optim_steps):
             # The model's noise is the same in every round: costs of different rounds compare.

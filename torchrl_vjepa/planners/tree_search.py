@@ -189,7 +189,7 @@ class TreeSearch(DiscretePlanner):
         search = _Search(self, self._expansion(state), room)
         if any_warm:
             search.follow(index, warm)
-        clock.begin()
+            clock.begin()
         for gumbel in noise:
             search.simulate(gumbel)
             if not clock.another(search.best_cost):
