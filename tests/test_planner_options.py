@@ -182,6 +182,8 @@ class TestReportedRisks:
         assert stats["violation"].shape == (3, 1)
 
     def test_early_refusal(self) -> None:
+        with pytest.raises(TypeError, match="return_stats must be True, False or risks by name.*got list"):
+            CEM(make_env(), 3, return_stats=[worst_case])  # type: ignore[arg-type]  # wrong on purpose
         with pytest.raises(ValueError, match="return_stats must not rename 'cost'"):
             CEM(make_env(noisy, how="sample"), 2, return_stats={"cost": expectation})
         with pytest.raises(ValueError, match="num_samples"):

@@ -107,9 +107,10 @@ class Planner(MPCPlannerBase):
             "reduce-overhead"}`` are CUDA graphs on a GPU). The first call, and the first of each new batch
             size, takes long.
         return_stats: also write ``("plan_stats", "actions")`` (the plan), ``("plan_stats", "std")``
-            (spread of the proposal), ``("plan_stats", "cost")`` (predicted cost of the plan) and, if
-            there are ``C`` constraints, ``("plan_stats", "violation")`` (predicted probabilities,
-            ``(*B, C)``); cost and violation from fresh noise. A mapping ``name -> risk`` also writes these
+            (spread of the proposal; of the one to start from in steps without a search),
+            ``("plan_stats", "cost")`` (predicted cost of the plan) and, if there are ``C`` constraints,
+            ``("plan_stats", "violation")`` (predicted probabilities, ``(*B, C)``); cost and violation from
+            fresh noise. A mapping ``name -> risk`` also writes these
             risks of the plan's cost, from the same noise, under ``("plan_stats", name)``.
         plan_key: the plan's entry.
         init_key: set where an episode begins (``InitTracker``).
@@ -439,6 +440,11 @@ class Planner(MPCPlannerBase):
 
     def _checked_risks(self, return_stats: bool | Mapping[str, Risk]) -> dict[str, Risk]:
         """The risks that are reported, refused early where they cannot be."""
+        if not isinstance(return_stats, (bool, Mapping)):
+            raise TypeError(
+                "return_stats must be True, False or risks by name, for instance {'worst tenth': cvar(0.1)}, "
+                f"got {type(return_stats).__name__}"
+            )
         risks = dict(return_stats) if isinstance(return_stats, Mapping) else {}
         for name, risk in risks.items():
             if name in _STATISTICS:
