@@ -9,11 +9,10 @@ gradients. Planners start warm from their plan of the step before.
 from __future__ import annotations
 
 import importlib
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
@@ -264,7 +263,6 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> None:
     ax.axvline(ARITHMETIC, color="black", ls=":", lw=1, label="512 x 15 x 4")
     ax.set(xscale="log", yscale="log", xlabel="steps of the model for one action", ylabel="cost / LQG - 1")
     ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    folder.mkdir(parents=True, exist_ok=True)
     fig.savefig(folder / "planner_quality.png", dpi=150)
     plt.close(fig)
 
@@ -273,16 +271,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run all contenders, print the table, write JSON and figure."""
     parser = _settings.command_line(Settings, __doc__)
     settings, args = _settings.read_settings(parser, Settings, QUICK, arguments)
-    torch.set_num_threads(1)
+    _settings.prepare(args)
     start = time.perf_counter()
     with torch.no_grad():
         rows = run(settings)
     print(table(rows))
     draw(rows, args.out)
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        result = {"settings": asdict(settings), "wall_s": time.perf_counter() - start, "rows": rows}
-        args.json.write_text(json.dumps(result, indent=1))
+    _settings.write_report(args, settings, wall_s=time.perf_counter() - start, rows=rows)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -384,7 +383,6 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> None:
         ax.set_yticks(range(len(names)), names)
         ax.invert_yaxis()
         ax.legend(frameon=False, fontsize=8)
-    folder.mkdir(parents=True, exist_ok=True)
     fig.savefig(folder / "planners_speed.png", dpi=150)
     plt.close(fig)
 
@@ -393,7 +391,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print the table, write JSON and figure."""
     parser = _settings.command_line(Settings, __doc__)
     settings, args = _settings.read_settings(parser, Settings, QUICK, arguments)
-    torch.set_num_threads(1)
+    _settings.prepare(args)
     start = time.perf_counter()
     rows, left_out = [], []
     work = [(size, num) for size in settings.sizes for num in settings.num_envs]
@@ -410,10 +408,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if importlib.util.find_spec("pytorch_mppi") is None:
         print('pytorch_mppi is not installed (the extra "benchmarks"): not measured')
     draw(rows, args.out)
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        result = {"settings": asdict(settings), "wall_s": time.perf_counter() - start, "rows": rows}
-        args.json.write_text(json.dumps(result, indent=1))
+    _settings.write_report(args, settings, wall_s=time.perf_counter() - start, rows=rows)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from own_objective import OwnObjective
 from specs import EVERY, specs
 from tensordict import TensorDict
 from tensordict.nn import (
@@ -35,8 +36,8 @@ from torch.distributions import (
 )
 from torch.distributions import Categorical as CategoricalDistribution
 from torch.distributions.transforms import SigmoidTransform
-from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, PendulumEnv, TransformedEnv, UnsqueezeTransform
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
+from torchrl.envs import PendulumEnv, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import (
     Actor,
@@ -868,38 +869,10 @@ class TestArguments:
 
     def test_an_environment_with_an_objective_alone(self) -> None:
         with pytest.raises(TypeError, match="policy needs an environment that imagines step by step"):
-            CEM(Objective(), 2, policy=tanh_policy())
+            CEM(OwnObjective(), 2, policy=tanh_policy())
 
     def test_defaults(self) -> None:
         assert make_planner(CEM, self.SPEC).num_policy_candidates == 0
         for num, expected in ((512, 25), (40, 2), (12, 1)):
             planner = make_planner(CEM, self.SPEC, policy=tanh_policy(), num_candidates=num, top_k=4)
             assert planner.num_policy_candidates == expected
-
-
-class Objective(EnvBase):
-    def __init__(self) -> None:
-        super().__init__(batch_size=[])
-        self.observation_spec = Composite(latent=Unbounded((1,)))
-        self.action_spec = Bounded(-1, 1, (2,))
-        self.reward_spec = Unbounded((1,))
-        self.planning_keys = ["latent"]
-
-    @property
-    def batch_locked(self) -> bool:
-        return False
-
-    def planning_state(self, td: TensorDict) -> Tensor:
-        return td["latent"]
-
-    def objective(self, state: Any, actions: Tensor, *, generator: Any = None) -> Tensor:
-        return actions.square().sum(dim=(-1, -2))
-
-    def _step(self, td: TensorDict) -> TensorDict:
-        return td
-
-    def _reset(self, td: Any = None, **kwargs: Any) -> TensorDict:
-        return TensorDict(latent=torch.zeros(1))
-
-    def _set_seed(self, seed: int | None) -> None:
-        pass

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from own_objective import OwnObjective
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -573,34 +574,6 @@ class TestStepped:
                 highest = torch.maximum(highest, td["th"].cos())
             upright.append(float(highest))
         assert upright[1] > 0.9 > upright[0]
-
-
-class OwnObjective(EnvBase):
-    def __init__(self) -> None:
-        super().__init__(batch_size=[])
-        self.observation_spec = Composite(latent=Unbounded((1,)))
-        self.action_spec = Bounded(-1, 1, (1,))
-        self.reward_spec = Unbounded((1,))
-        self.planning_keys = ["latent"]
-
-    @property
-    def batch_locked(self) -> bool:
-        return False
-
-    def planning_state(self, td: TensorDict) -> Tensor:
-        return td["latent"]
-
-    def objective(self, state: Any, actions: Tensor, *, generator: Any = None) -> Tensor:
-        return actions.square().sum(dim=(-1, -2))
-
-    def _step(self, td: TensorDict) -> TensorDict:
-        return td
-
-    def _reset(self, td: Any = None, **kwargs: Any) -> TensorDict:
-        return TensorDict(latent=torch.zeros(1))
-
-    def _set_seed(self, seed: int | None) -> None:
-        pass
 
 
 class OlderObjective(LatentEnv):

@@ -163,8 +163,6 @@ class SamplingPlanner(Planner):
         for name, fraction in (("keep_elites", keep_elites), ("carry_elites", carry_elites)):
             if not 0 <= fraction <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {fraction}")
-        if carry_elites and not kwargs.get("warm_start", True):
-            raise ValueError(f"carry_elites must be 0 without warm_start, got {carry_elites}")
         if not 0 < population_decay <= 1:
             raise ValueError(f"population_decay must be in (0, 1], got {population_decay}")
         if population_decay < 1 and 2 * top_k >= num_candidates:
@@ -179,6 +177,8 @@ class SamplingPlanner(Planner):
                     f"num_policy_candidates must be None without a policy, got {num_policy_candidates}"
                 )
         super().__init__(env, planning_horizon, optim_steps, **kwargs)
+        if carry_elites and not self.warm_start:
+            raise ValueError(f"carry_elites must be 0 without warm_start, got {carry_elites}")
         self.policy: Any = policy
         self.num_policy_candidates = 0
         if policy is not None:
